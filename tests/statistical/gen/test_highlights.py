@@ -57,8 +57,7 @@ def truth() -> dict[str, float]:
 def plane() -> Highlights:
     """Highlights of the plane, from a pilot of its values."""
     pilot = PLAN.draw("pilot", 0, 8192)
-    found = fit_highlights(pilot, value_of(pilot))
-    return found
+    return fit_highlights(pilot, value_of(pilot))
 
 
 def drawn(highlights: Highlights) -> tuple[Queries, F64]:

@@ -41,8 +41,7 @@ def shape_of(builder: GltfBuilder, folder: Path) -> MeshShape:
 
 
 def texture_of(shape: MeshShape, role: str = "base_color") -> Texture:
-    value = shape.values[role]
-    return value[0]
+    return shape.values[role][0]
 
 
 def extension(name: str, **values: Any) -> dict[str, Any]:

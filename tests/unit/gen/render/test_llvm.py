@@ -105,9 +105,6 @@ def test_a_failed_proof_is_not_cached(monkeypatch: pytest.MonkeyPatch) -> None:
             engine.check_llvm()
 
 
-# What a child of the test below runs.
-
-
 SHOWN = """
 from mbtf_gen.engine.runtime import load_mitsuba
 load_mitsuba()

@@ -26,15 +26,10 @@ LAYERS = {
 }
 
 
-def tile_at(path: Path) -> MeshTile:
-    tile = load_material(path)
-    return tile
-
-
 def tile_of(builder: GltfBuilder, folder: Path, yaml: str = "") -> MeshTile:
     builder.write(folder / "a.glb")
     (folder / "m.yaml").write_text(f"mesh: a.glb\nperiod: [1, 1]\n{yaml}")
-    return tile_at(folder / "m.yaml")
+    return load_material(folder / "m.yaml")
 
 
 def looked_up(value: Any, uv: np.ndarray) -> np.ndarray:

@@ -119,12 +119,10 @@ class TestPacked:
     @pytest.mark.parametrize(
         ("name", "roughness", "metallic"),
         [
-            *(
-                ("x_ARM", "G", "B"),
-                ("x_rma", "R", "G"),
-                ("x_MRAO", "G", "R"),
-                ("x_RoughnessMetallicAO", "R", "G"),
-            ),
+            ("x_ARM", "G", "B"),
+            ("x_rma", "R", "G"),
+            ("x_MRAO", "G", "R"),
+            ("x_RoughnessMetallicAO", "R", "G"),
         ],
     )
     def test_its_name_says_what_its_channels_are(

@@ -13,7 +13,7 @@ from support.paths import ROOT
 from mbtf_core.images.read import gray, read_image
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.loading import load_material
-from mbtf_gen.tile.maps.normal_map import SYMMETRIES, NormalFit, fit_normals
+from mbtf_gen.tile.maps.normal_map import SYMMETRIES, fit_normals
 
 # What undoes each symmetry.
 UNDO = {
@@ -30,16 +30,11 @@ def height_map(kind: str) -> Floats:
     return np.asarray(gray(read_image(ASSET))[0], np.float64)
 
 
-def fit(height: Floats, normal: Floats) -> NormalFit:
-    found = fit_normals(height, normal)
-    return found
-
-
 @pytest.mark.parametrize("kind", ["fractal", "asset"])
 @pytest.mark.parametrize("green", [1, -1])
 def test_convention_and_scale(kind: str, green: int) -> None:
     height = height_map(kind)
-    found = fit(height, normals_of(height, 0.07) * [1, green, 1])
+    found = fit_normals(height, normals_of(height, 0.07) * [1, green, 1])
     assert found.fits
     assert not found.misfit
     assert found.convention == ("gl" if green == 1 else "dx")
@@ -55,7 +50,7 @@ def test_convention_and_scale(kind: str, green: int) -> None:
 def test_turned_heights(kind: str, turn: str, green: int) -> None:
     height = height_map(kind)
     moved = SYMMETRIES[turn](height)
-    found = fit(moved, normals_of(height, 0.05) * [1, green, 1])
+    found = fit_normals(moved, normals_of(height, 0.05) * [1, green, 1])
     assert found.misfit
     assert not found.fits
     assert found.convention is None
@@ -76,7 +71,7 @@ class TestNoFinding:
         """Unrelated noise never counts as a fit or a misfit."""
         for seed in range(20):
             a, b = (fractal(size, size, 0.0, 100 * seed + k) for k in range(2))
-            found = fit(a, normals_of(b, 0.1))
+            found = fit_normals(a, normals_of(b, 0.1))
             assert not found.fits
             assert not found.misfit
             assert found.convention is None
@@ -84,7 +79,7 @@ class TestNoFinding:
     def test_ridges_have_no_convention(self) -> None:
         """Slopes along u only: the green channel is empty."""
         ridges = np.tile(fractal(64, 64)[:1], (64, 1))
-        found = fit(ridges, normals_of(ridges, 0.05))
+        found = fit_normals(ridges, normals_of(ridges, 0.05))
         assert found.fits
         assert found.convention is None
 
@@ -93,7 +88,7 @@ class TestNoFinding:
         for size in range(24, 48):
             x = (np.arange(size) + 0.5) / size * 2 * np.pi
             waves = np.cos(x)[:, None] + np.cos(x) + 0.3 * np.cos(3 * x)[:, None] * np.cos(3 * x)
-            found = fit(waves, normals_of(waves, 0.05))
+            found = fit_normals(waves, normals_of(waves, 0.05))
             assert found.fits
             assert found.turn == ""
 
