@@ -21,6 +21,7 @@ from mbtf_core.stats import (
     level_groups,
     local_error,
     mean_estimate,
+    mean_of_halves,
     noise_free_mse,
     pooled_variance,
     signal_variance,
@@ -79,6 +80,13 @@ def test_numbers_that_are_not_finite_are_refused_with_their_place() -> None:
         InputError, match=r"value_b: 1 numbers are NaN or infinite, the first at index \(2, 1\)"
     ):
         pooled_variance(np.ones((4, 3)), a)
+
+
+def test_the_noise_of_halves_has_a_degree_of_freedom_for_each_query_that_counts() -> None:
+    a, b = np.random.default_rng(0).normal(size=(2, 20_000))
+    assert mean_of_halves(a, b).dof == pytest.approx(20_000, rel=0.05)
+    a[1:], b[1:] = 1e-6 * a[1:], 1e-6 * b[1:]
+    assert mean_of_halves(a, b).dof == pytest.approx(1, rel=1e-3)
 
 
 def test_groups() -> None:
