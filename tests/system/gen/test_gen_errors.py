@@ -9,9 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.commands import Done, finished, run_all, start
-from support.datasets import edit, write_dataset
-
-from mbtf_core.data.schema import SCHEMA_VERSION
+from support.datasets import write_dataset
 
 INPUT, USAGE = 3, 2
 
@@ -22,9 +20,7 @@ INPUT_CASES = {
     "aspects": ["base_color.npy", "8 x 4", "8 x 8", "aspect"],
     "empty": ["empty", "no image"],
     "heights.npy --config config.yaml --seed 1": ["config.yaml:3", "'queries.mincos'", "'min_cos'"],
-    "verify schema": ["schema version 99", f"version {SCHEMA_VERSION}"],
     "merge empty": ["empty", "manifest.json"],
-    "verify nowhere": ["nowhere", "no such folder"],
     "reference heights.npy -o aspects": ["aspects", "no pictures"],
     "heights.npy -o aspects": ["aspects", "holds no data set"],
     "heights.npy -o notes.txt/below": ["notes.txt"],
@@ -51,9 +47,6 @@ def write_inputs(folder: Path) -> None:
     np.save(folder / "aspects/height.npy", np.zeros((8, 8)))
     np.save(folder / "aspects/base_color.npy", np.zeros((4, 8, 3)))
     (folder / "config.yaml").write_text("queries:\n  spp: 4\n  mincos: 0.2\n")
-    write_dataset(folder / "schema", queries={"train": "8", "test": "8"})
-    manifest = folder / "schema/manifest.json"
-    edit(manifest, lambda document: document.update(schema=99))
 
 
 def listing(folder: Path) -> dict[str, bytes]:

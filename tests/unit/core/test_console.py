@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import math
-import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -128,24 +126,3 @@ def test_the_time_left_counts_neither_set_up_nor_earlier_runs(
         "fitting: 65%, 1:00 elapsed, 0:35 left, loss 2",
         "fitting: 67%, 1:00 elapsed, 0:29 left, loss 0",
     ]
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no pseudo-terminals")
-def test_progress_on_a_terminal_is_a_bar() -> None:
-    import os
-    import pty
-    import subprocess
-
-    note = "loss 0.123, unexplained 0.250 ± 0.010, 1.23 M queries/s"
-    code = "from mbtf_core.app.console import CONSOLE\n"
-    code += f"with CONSOLE.progress(3, 'rendering') as bar: bar.advance(3, {note!r})"
-    reader, writer = pty.openpty()
-    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "60"}
-    subprocess.run([sys.executable, "-c", code], stderr=writer, env=environment, check=True)
-    os.close(writer)
-    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", os.read(reader, 65536).decode())
-    os.close(reader)
-    lines = [line.strip() for line in re.split(r"[\r\n]+", plain) if line.strip()]
-    assert note in lines
-    assert any("━" in line and "100%" in line for line in lines)
-    assert all(re.match(r"rendering ━+ |loss ", line) and len(line) <= 60 for line in lines), lines

@@ -28,24 +28,6 @@ def test_the_same_command_gives_the_same_bytes(form: str, shards: Path, tmp_path
     assert contents(first) == contents(second)
 
 
-def test_what_has_changed_is_replaced_on_request_only(shards: Path, tmp_path: Path) -> None:
-    card = publish(shards, tmp_path / "card", form="parquet")
-    whole = contents(card)
-    for name in ("README.md", "croissant.json", "data/train-00000.parquet"):
-        content = bytearray(whole[name])
-        content[len(content) // 2] ^= 1
-        (card / name).write_bytes(content)
-        with pytest.raises(InputError, match=f"{name}: has been edited, or damaged"):
-            publish(shards, card, form="parquet")
-        assert (card / name).read_bytes() == content
-        (card / name).unlink()
-        publish(shards, card, form="parquet")
-        assert contents(card) == whole
-    (card / "README.md").write_text("mine")
-    Publication.prepare(shards, CONFIG).write(card, overwrite=True)
-    assert contents(card) == whole
-
-
 def test_other_options_are_refused_and_replace(shards: Path, tmp_path: Path) -> None:
     card = publish(shards, tmp_path / "card", form="parquet")
     (card / "mine.txt").write_text("kept")
