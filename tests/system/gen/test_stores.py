@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 from support.commands import Done
-from support.object_stores import BUCKET, Proxy, s3_server
+from support.object_stores import BUCKET, Proxy, downloaded, s3_server
 from support.small_runs import command, contents, generate, noisy_plane, write_maps
 
 from mbtf_core.data.store import ObjectStore
@@ -74,11 +74,7 @@ def generated(folder: Path, *, train: int = 100) -> dict[str, Any]:
 
 def stored(folder: Path) -> dict[str, Any]:
     """Contents of the store."""
-    store = ObjectStore(URL)
-    folder.mkdir()
-    for name in store.list():
-        (folder / name).write_bytes(store.read(name))
-    return contents(folder)
+    return contents(downloaded(URL, folder))
 
 
 def test_a_data_set_from_generation_to_fit(tmp_path: Path, proxy: Proxy) -> None:

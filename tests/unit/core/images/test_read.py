@@ -184,19 +184,18 @@ class TestTiff:
         assert np.array_equal(read_image(tmp_path / "x.tif").pixels[..., 0], (largest - stored) / largest)
 
 
-class TestLayers:
-    def test_several_parts(self, tmp_path: Path) -> None:
-        import OpenEXR
+def test_several_parts(tmp_path: Path) -> None:
+    import OpenEXR
 
-        rough, disp = (rng().random((4, 6)).astype(np.float32) for _ in range(2))
-        head = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        layers = (("rough", rough), ("disp", disp + 1))
-        parts = [OpenEXR.Part({**head, "name": name}, {"Y": y}, name) for name, y in layers]
-        OpenEXR.File(parts).write(str(tmp_path / "x.exr"))
-        image = read_image(tmp_path / "x.exr", "disp")
-        assert np.array_equal(image.pixels[..., 0], disp + 1)
-        assert image.channels == ("disp.Y",)
-        assert np.array_equal(read_image(tmp_path / "x.exr", "rough.Y").pixels[..., 0], rough)
+    rough, disp = (rng().random((4, 6)).astype(np.float32) for _ in range(2))
+    head = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    layers = (("rough", rough), ("disp", disp + 1))
+    parts = [OpenEXR.Part({**head, "name": name}, {"Y": y}, name) for name, y in layers]
+    OpenEXR.File(parts).write(str(tmp_path / "x.exr"))
+    image = read_image(tmp_path / "x.exr", "disp")
+    assert np.array_equal(image.pixels[..., 0], disp + 1)
+    assert image.channels == ("disp.Y",)
+    assert np.array_equal(read_image(tmp_path / "x.exr", "rough.Y").pixels[..., 0], rough)
 
 
 def test_single_channels_of_other_kinds(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.object_stores import memory_store
+from support.object_stores import downloaded, memory_store
 from support.small_runs import command, contents, generate, noisy_plane
 
 from mbtf_core.app.console import run
@@ -46,15 +46,6 @@ def url(tmp_path: Path) -> Iterator[str]:
 def command_at(folder: Path, url: str, *more: str, **options: Any) -> list[str]:
     line = command(folder, Path("OUT"), **options)
     return [url if word == "OUT" else word for word in line] + list(more)
-
-
-def downloaded(url: str, folder: Path) -> Path:
-    """A local copy of everything in a store."""
-    store = ObjectStore(url)
-    folder.mkdir()
-    for name in store.list():
-        (folder / name).write_bytes(store.read(name))
-    return folder
 
 
 @pytest.mark.parametrize("suffix", ["npz", "exr"])

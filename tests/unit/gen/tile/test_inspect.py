@@ -20,17 +20,16 @@ from mbtf_gen.tile.inspection import inspection_text
 from mbtf_gen.tile.loading import load_material
 
 
-class TestSlopes:
-    @pytest.mark.parametrize("aspect", [1.0, 0.5])
-    def test_slopes_are_those_of_the_mesh(self, aspect: float) -> None:
-        """Against the triangles that are rendered."""
-        from mbtf_gen.tile.heights import tile_mesh
+@pytest.mark.parametrize("aspect", [1.0, 0.5])
+def test_slopes_are_those_of_the_mesh(aspect: float) -> None:
+    """Against the triangles that are rendered."""
+    from mbtf_gen.tile.heights import tile_mesh
 
-        grid = HeightGrid.from_map(fractal(int(12 * aspect), 12), 0.2, aspect)
-        normals = tile_mesh(grid).face_normals
-        expected = np.hypot(normals[:, 0], normals[:, 1]) / normals[:, 2]
-        assert np.sort(triangle_slopes(grid)) == pytest.approx(np.sort(expected))
-        assert rms_slope(grid) == pytest.approx(np.sqrt(np.mean(expected**2)))
+    grid = HeightGrid.from_map(fractal(int(12 * aspect), 12), 0.2, aspect)
+    normals = tile_mesh(grid).face_normals
+    expected = np.hypot(normals[:, 0], normals[:, 1]) / normals[:, 2]
+    assert np.sort(triangle_slopes(grid)) == pytest.approx(np.sort(expected))
+    assert rms_slope(grid) == pytest.approx(np.sqrt(np.mean(expected**2)))
 
 
 @pytest.fixture
@@ -131,16 +130,15 @@ class TestWrite:
         assert plain.config.queries == flagged.config.queries
 
 
-class TestExport:
-    @pytest.mark.parametrize("flags", [(), ("--mesh", "40"), ("--height-scale", "-0.2")])
-    def test_read_back_it_is_the_same_grid(self, tmp_path: Path, flags: tuple[str, ...]) -> None:
-        """8-bit heights, dequantized and resampled."""
-        save_heights(tmp_path / "height.png", fractal(48, 96), 8)
-        out = tmp_path / "out" / "heights.exr"
-        assert run(app, ["inspect", str(tmp_path), "--export", str(out), *flags]) == 0
-        mesh = int(flags[1]) if flags[:1] == ("--mesh",) else None
-        scale = float(flags[1]) if flags[:1] == ("--height-scale",) else None
-        expected, found = load_material(tmp_path).at(scale, mesh).grid, load_material(out).grid
-        assert np.array_equal(found.z, expected.z.astype(np.float32))
-        assert found.z.max() == 0.0
-        assert found.aspect == expected.aspect
+@pytest.mark.parametrize("flags", [(), ("--mesh", "40"), ("--height-scale", "-0.2")])
+def test_read_back_it_is_the_same_grid(tmp_path: Path, flags: tuple[str, ...]) -> None:
+    """8-bit heights, dequantized and resampled."""
+    save_heights(tmp_path / "height.png", fractal(48, 96), 8)
+    out = tmp_path / "out" / "heights.exr"
+    assert run(app, ["inspect", str(tmp_path), "--export", str(out), *flags]) == 0
+    mesh = int(flags[1]) if flags[:1] == ("--mesh",) else None
+    scale = float(flags[1]) if flags[:1] == ("--height-scale",) else None
+    expected, found = load_material(tmp_path).at(scale, mesh).grid, load_material(out).grid
+    assert np.array_equal(found.z, expected.z.astype(np.float32))
+    assert found.z.max() == 0.0
+    assert found.aspect == expected.aspect

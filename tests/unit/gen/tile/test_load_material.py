@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 from support import image_files
+from support.image_files import rng
 from support.paths import ROOT
 
 from mbtf_core.color import srgb_to_linear
@@ -19,16 +20,9 @@ from mbtf_gen.tile.loading import latest_material, load_material
 from mbtf_gen.tile.maps.file_names import GLOSS_WORDS, LETTERS, SMOOTHNESS_IN_ALPHA, WEAK_WORDS, WORDS
 
 
-def rng() -> np.random.Generator:
-    """A generator that gives the same numbers in every test."""
-    return np.random.default_rng(3)
-
-
 def png(path: Path, codes: NDArray[Any]) -> Path:
-    from PIL import Image as Pillow
-
     path.parent.mkdir(parents=True, exist_ok=True)
-    Pillow.fromarray(codes).save(path)
+    Image.fromarray(codes).save(path)
     return path
 
 
@@ -75,12 +69,11 @@ class TestBareFile:
         assert load_material(npy(tmp_path / "h.npy", np.array([[0.0, 0.5]]))).warnings_in_use() == ()
 
 
-class TestGrid:
-    def test_default_mesh_follows_the_map_up_to_a_limit(self, tmp_path: Path) -> None:
-        assert load_material(npy(tmp_path / "a.npy", rng().random((30, 20)))).grid.z.shape == (30, 20)
-        wide = load_material(npy(tmp_path / "b.npy", rng().random((100, 1000))))
-        assert wide.grid.z.shape == (51, 512)
-        assert wide.grid.aspect == 0.1
+def test_default_mesh_follows_the_map_up_to_a_limit(tmp_path: Path) -> None:
+    assert load_material(npy(tmp_path / "a.npy", rng().random((30, 20)))).grid.z.shape == (30, 20)
+    wide = load_material(npy(tmp_path / "b.npy", rng().random((100, 1000))))
+    assert wide.grid.z.shape == (51, 512)
+    assert wide.grid.aspect == 0.1
 
 
 class TestFolder:
@@ -154,14 +147,10 @@ class TestDigests:
         assert load_material(path).digests == load_material(folder / "rock_height.npy").digests
 
 
-def write_png(path: Path, codes: NDArray[np.uint8]) -> None:
-    Image.fromarray(codes).save(path)
-
-
 @pytest.fixture
 def changing(tmp_path: Path) -> Path:
-    write_png(tmp_path / "height.png", np.arange(64, dtype=np.uint8).reshape(8, 8))
-    write_png(tmp_path / "roughness.png", np.full((8, 8), 90, np.uint8))
+    png(tmp_path / "height.png", np.arange(64, dtype=np.uint8).reshape(8, 8))
+    png(tmp_path / "roughness.png", np.full((8, 8), 90, np.uint8))
     return tmp_path
 
 
@@ -178,12 +167,12 @@ def test_a_changed_folder_is_loaded_again(changing: Path) -> None:
     # As many bytes, and the same times, as before.
     path = changing / "roughness.png"
     stat = path.stat()
-    write_png(path, np.full((8, 8), 200, np.uint8))
+    png(path, np.full((8, 8), 200, np.uint8))
     os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
     second = latest_material(changing)
     before, after = (np.asarray(m.maps["roughness"], np.float64).mean() for m in (first, second))
     assert after > before
-    write_png(changing / "metallic.png", np.full((8, 8), 255, np.uint8))
+    png(changing / "metallic.png", np.full((8, 8), 255, np.uint8))
     assert np.mean(latest_material(changing).maps["metallic"]) == 1.0 != np.mean(second.maps["metallic"])
     (changing / "material.yaml").write_text("height: {file: height.png, scale: 0.3}\n", encoding="utf-8")
     assert latest_material(changing).height_scale == 0.3

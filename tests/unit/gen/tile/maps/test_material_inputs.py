@@ -26,27 +26,25 @@ def heights(tmp_path: Path) -> Path:
     return tmp_path
 
 
-class TestHeights:
-    def test_color_is_refused_with_the_way_out(self, tmp_path: Path) -> None:
-        codes = rng().integers(0, 256, (8, 8, 3))
-        path = png(tmp_path / "height.png", codes, 2, 8)
-        with pytest.raises(InputError, match=r"height\.png: is colored; a height map is gray") as caught:
-            load_material(path)
-        assert "channel: R" in caught.value.hint
-        text = "height: {file: height.png, channel: G, dequantize: false}\n"
-        material = load_material(write(tmp_path, text))
-        assert np.array_equal(np.rint(material.height * 255), codes[..., 1])
+def test_color_is_refused_with_the_way_out(tmp_path: Path) -> None:
+    codes = rng().integers(0, 256, (8, 8, 3))
+    path = png(tmp_path / "height.png", codes, 2, 8)
+    with pytest.raises(InputError, match=r"height\.png: is colored; a height map is gray") as caught:
+        load_material(path)
+    assert "channel: R" in caught.value.hint
+    text = "height: {file: height.png, channel: G, dequantize: false}\n"
+    material = load_material(write(tmp_path, text))
+    assert np.array_equal(np.rint(material.height * 255), codes[..., 1])
 
 
-class TestLayers:
-    def test_the_option_decides(self, tmp_path: Path) -> None:
-        names = ("R", "G", "B", "displacement.Y", "extra.Y")
-        stored = {n: (rng().random((6, 9)) / (i + 1)).astype(np.float32) for i, n in enumerate(names)}
-        exr(tmp_path / "all.exr", stored)
-        path = write(tmp_path, "height: {file: all.exr, channel: extra.Y}\nbase_color: all.exr\n")
-        material = load_material(path)
-        assert np.array_equal(material.height, stored["extra.Y"])
-        assert np.array_equal(material.maps["base_color"], np.stack([stored[c] for c in "RGB"], axis=-1))
+def test_the_option_decides(tmp_path: Path) -> None:
+    names = ("R", "G", "B", "displacement.Y", "extra.Y")
+    stored = {n: (rng().random((6, 9)) / (i + 1)).astype(np.float32) for i, n in enumerate(names)}
+    exr(tmp_path / "all.exr", stored)
+    path = write(tmp_path, "height: {file: all.exr, channel: extra.Y}\nbase_color: all.exr\n")
+    material = load_material(path)
+    assert np.array_equal(material.height, stored["extra.Y"])
+    assert np.array_equal(material.maps["base_color"], np.stack([stored[c] for c in "RGB"], axis=-1))
 
 
 class TestScalars:
@@ -119,15 +117,14 @@ class TestColor:
             assert np.abs(material.maps["base_color"] - expected).max() < 1e-6, (option, chunks)
 
 
-class TestNamesOfFiles:
-    def test_backslashes_separate(self, heights: Path) -> None:
-        codes = rng().integers(0, 256, (8, 16, 1))
-        (heights / "maps").mkdir()
-        png(heights / "maps" / "rough.png", codes, 0, 8)
-        path = write(heights, "height: height.npy\nroughness: maps\\rough.png\n")
-        expected = {"height": "height.npy", "roughness": "maps/rough.png"}
-        files = load_material(path).files
-        assert {role: file.relative_to(heights).as_posix() for role, file in files.items()} == expected
+def test_backslashes_separate(heights: Path) -> None:
+    codes = rng().integers(0, 256, (8, 16, 1))
+    (heights / "maps").mkdir()
+    png(heights / "maps" / "rough.png", codes, 0, 8)
+    path = write(heights, "height: height.npy\nroughness: maps\\rough.png\n")
+    expected = {"height": "height.npy", "roughness": "maps/rough.png"}
+    files = load_material(path).files
+    assert {role: file.relative_to(heights).as_posix() for role, file in files.items()} == expected
 
 
 ACESCG = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
