@@ -90,8 +90,7 @@ def test_polished_dielectric_mirrors_and_scatters_the_rest() -> None:
 @pytest.mark.parametrize("kind", ["metallic", "specular", "clearcoat"])
 @pytest.mark.parametrize("width", [0.05, 0.2, 1.0])
 def test_value_is_continuous_from_a_mirror_on(kind: str, width: float) -> None:
-    """The mirror below roughness 0.00316 and the lobe above it do not differ, even at the mirrored
-    direction under a light narrower than the sun."""
+    """The mirror is below a roughness of 0.00316; seen where it reflects a light narrower than the sun."""
     light = LightKernel(width)
     omega_o = towards(np.array([0.95, 0.5, 0.2, 0.05]), 10.0)
     omega_i = mirrored(omega_o)
@@ -105,8 +104,7 @@ def test_value_is_continuous_from_a_mirror_on(kind: str, width: float) -> None:
 
 
 def smeared(alpha: float, light: LightKernel, omega_i: Array, cosine: float) -> float:
-    """White metal at the mirrored direction: its lobe under a light, by quadrature over facet slopes in
-    double precision. Masking is neglected, which narrow lobes permit at such views."""
+    """White metal at the mirrored direction by quadrature over facet slopes; narrow lobes need no masking."""
     x, w = np.polynomial.legendre.leggauss(120)
     t, phi = np.meshgrid(0.5 * (x + 1), np.pi * (x + 1), indexing="ij")
     tangent = alpha * t / (1 - t)

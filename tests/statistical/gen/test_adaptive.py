@@ -113,8 +113,7 @@ def test_a_group_has_the_paths_of_its_noisiest_query(skewed: tuple[Queries, Allo
 def test_a_skewed_scene_comes_near_its_target_and_what_is_reported_is_so(
     most: int, low: float, high: float, skewed: tuple[Queries, Allocation]
 ) -> None:
-    """Also what a cap leaves: rare bright paths increase the value itself, so relative errors would rarely
-    exceed one."""
+    """Also what a cap leaves, although rare bright paths increase the value itself."""
     q, allocation = skewed
     e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, most), Stream(1, "train", 0), allocation)
     value = 0.5 * (e.value_a[:, 0].astype(np.float64) + e.value_b[:, 0])

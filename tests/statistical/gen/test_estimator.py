@@ -111,8 +111,7 @@ def test_nonfinite_samples_are_resampled_and_counted(bad: float, lights: int) ->
 
 
 def test_nonfinite_samples_are_located() -> None:
-    """The facet of a groove towards u = 0 has a faulty stripe: queries on it fail directly, those on the
-    other facet by light reflected from the stripe."""
+    """One facet of a groove has a faulty stripe: the other one fails by light reflected from it."""
     groove = HeightGrid(np.tile([0.0, -0.4], (2, 1)), 1.0)
     e = Estimator(build_scene(groove, Faulty(mi.Properties(), np.nan, 1.0)), LightKernel(0.0), Transport())
     n = 500

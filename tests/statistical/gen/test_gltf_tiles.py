@@ -74,8 +74,7 @@ def bitmap(pixels: NDArray[Any], wrap: str) -> dict[str, Any]:
 
 
 def test_mitsuba_agrees_on_a_file_of_many_features(tmp_path: Path) -> None:
-    """A floor whose texture is turned and mirrored, by a second set of quantized coordinates; golden fins,
-    quantized and of several nodes, whose roughness varies."""
+    """A floor of turned, mirrored, second texture coordinates; quantized golden fins of several nodes."""
     rng = np.random.default_rng(3)
     codes, gloss = rng.integers(0, 256, (4, 5, 3), np.uint8), rng.integers(60, 160, (3, 2, 3), np.uint8)
     builder = GltfBuilder()

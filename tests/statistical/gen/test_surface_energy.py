@@ -255,8 +255,7 @@ def test_narrow_metal_lobe_is_mitsubas_roughconductor(roughness: float) -> None:
 
 
 def test_metal_gives_back_what_one_scattering_loses() -> None:
-    """Kulla and Conty 2017: of the energy lost by single scattering, Fms = F̄ (F̄ Ā + F̄² (1-Ā) Ā + …) is
-    returned."""
+    """Kulla and Conty 2017: of the energy lost at first, F̄ (F̄ Ā + F̄² (1-Ā) Ā + …) is returned."""
     roughness, cosine = 1.0, 0.7
     x, w = np.polynomial.legendre.leggauss(160)
     mu, phi = np.meshgrid(0.5 * (x + 1), 0.5 * np.pi * (x + 1), indexing="ij")

@@ -65,8 +65,7 @@ def test_masking_keeps_its_digits(alpha: float) -> None:
 
 @pytest.mark.parametrize("cosine", [0.9999, 0.7, 0.1, 1e-2])
 def test_half_vectors_keep_the_digits_of_narrow_lobes(cosine: float) -> None:
-    """Slopes of 1e-5 and less, of directions in single precision: their noise is of the order of its last
-    digit over the cosine across the plane of incidence, and without that factor within."""
+    """The last digit of single precision; across the plane of incidence, that over the cosine."""
     rng = np.random.default_rng(5)
     n = 2000
     slope = 1e-5 * rng.normal(size=(n, 2))

@@ -81,8 +81,7 @@ def test_dimensions_of_a_point_are_independent_of_each_other() -> None:
 
 
 def test_the_order_of_points_differs_between_dimensions() -> None:
-    """How many of eight points lie in the upper half of two dimensions: one order for all would make it 0 or
-    4."""
+    """Of eight points, how many lie in the upper half of both: one order for all would make it 0 or 4."""
     sampler = points(1 << 15, 8)
     first, second = (np.array(sampler.next_1d(), np.float64).reshape(-1, 8) > 0.5 for _ in range(2))
     both = (first & second).sum(axis=1).astype(np.float64)

@@ -86,15 +86,6 @@ class TestScalars:
         assert np.array_equal(np.rint(255 * np.asarray(material.maps["opacity"])), codes[..., 0])
         assert any("'mask'" in warning for warning in material.warnings)
 
-    def test_holes_in_the_alpha_of_a_color(self, heights: Path) -> None:
-        codes = rng().integers(0, 256, (8, 16, 4))
-        path = png(heights / "leaf_AlbedoTransparency.png", codes, 6, 8)
-        material = load_material(heights)
-        assert np.array_equal(np.rint(255 * np.asarray(material.maps["opacity"])), codes[..., 3])
-        assert material.warnings == ()
-        png(path, codes[..., :3], 2, 8)
-        assert "opacity" not in load_material(heights).maps
-
 
 class TestColor:
     def color(self, folder: Path, option: str, *chunks: tuple[bytes, bytes]) -> HeightFieldTile:
