@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 from dataclasses import replace
@@ -23,6 +24,7 @@ from mbtf_gen.generation import folder
 from mbtf_gen.generation import repair as repairs
 from mbtf_gen.generation import run as generation
 from mbtf_gen.generation.run import generate
+from mbtf_gen.generation.shard_record import ShardStatistics
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects_plan import EffectsPlan
 from mbtf_gen.planning.simulation import geometry_of
@@ -92,6 +94,16 @@ def test_too_many_nonfinite_samples_fail_the_run(config: GeneratorConfig, engine
     with pytest.raises(PartialError, match=f"8 of 320 samples.*{place}"):
         generate(config, out)
     assert not json.loads((out / "manifest.json").read_text())["complete"]
+
+
+@pytest.mark.parametrize(
+    ("count", "paths", "refused"), [(4, 1, False), (5, 4_999_999, True), (5, 5_000_000, False)]
+)
+def test_one_sample_in_a_million_may_be_nonfinite(count: int, paths: int, refused: bool) -> None:
+    statistics = ShardStatistics()
+    statistics.counts["nonfinite_samples"] = count
+    with pytest.raises(PartialError) if refused else contextlib.nullcontext():
+        statistics.refuse_nonfinite(paths, "out")
 
 
 def test_a_finished_run_renders_nothing(
