@@ -108,6 +108,12 @@ def test_wrap_modes(u: Any, v: Any) -> None:
     assert looked_up(found, uv) == pytest.approx(expected, abs=1e-4)
 
 
+def test_nearest_texels_are_not_interpolated() -> None:
+    texture = Texture(np.array([[[0.0] * 3, [1.0] * 3]], np.float32), ("repeat", "repeat"), nearest=True)
+    uv = np.array([[0.01, 0.5], [0.49, 0.5], [0.51, 0.5], [0.99, 0.5]])
+    assert looked_up((texture, np.ones(3)), uv)[:, 0].tolist() == [0, 0, 1, 1]
+
+
 def test_a_clamped_texture_that_reaches_too_far_is_refused() -> None:
     texture = Texture(np.zeros((512, 512, 3), np.float32), ("clamp", "repeat"))
     with pytest.raises(InputError, match="clamped"):
