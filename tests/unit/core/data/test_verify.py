@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -175,6 +177,20 @@ def test_wrong_rows_and_bad_numbers_are_found_behind_a_true_digest(copy: Path) -
         found = replace({**intact, "value_b": spoilt})
         assert found == "'value_b' holds NaN or infinite numbers: 1, the first in row 7"
     assert "unit vectors" in replace({**intact, "omega_o": 2 * intact["omega_o"]})
+
+
+def test_headers_are_parsed_in_one_thread(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In several threads an intact header may seem corrupt (CPython issue 106905)."""
+    alone = threading.Lock()
+
+    def read(path: Path) -> Any:
+        assert alone.acquire(blocking=False)
+        time.sleep(0.01)
+        alone.release()
+        return read_shard(path)
+
+    monkeypatch.setattr("mbtf_core.data.verify.read_shard", read)
+    assert verify(copy) == []
 
 
 @pytest.mark.parametrize("text", ["", "{}"])

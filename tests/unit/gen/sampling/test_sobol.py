@@ -149,6 +149,14 @@ def test_stream_numbers_are_distinct_and_fit_the_key() -> None:
     assert len({stream_number(*fields) for fields in dense}) == 2 * 64 * len(Purpose) * 32 * 2
 
 
+@pytest.mark.parametrize(
+    ("shard", "pass_index", "half"), [(-1, 0, 0), (MAX_SHARDS, 0, 0), (0, 4096, 0), (0, 0, 2)]
+)
+def test_fields_beyond_their_bits_are_refused(shard: int, pass_index: int, half: int) -> None:
+    with pytest.raises(ValueError, match=r"shard|pass"):
+        stream_number("train", shard, Purpose.PATH, pass_index, half)
+
+
 def test_numpy_generators_differ_in_every_field() -> None:
     fields = list(itertools.product((0, 1, 2**62), ("train", "test"), (0, 1, 7), Purpose, (0, 1)))
     first = {tuple(numpy_generator(*f).integers(0, 2**63, 2).tolist()) for f in fields}
