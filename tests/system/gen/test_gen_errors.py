@@ -17,12 +17,11 @@ INPUT, USAGE = 3, 2
 INPUT_CASES = {
     "nowhere.exr": ["nowhere.exr", "no such file"],
     "notes.doc": ["'.doc'", ".exr"],
-    "aspects": ["base_color.npy", "8 x 4", "8 x 8", "aspect"],
     "empty": ["empty", "no image"],
     "heights.npy --config config.yaml --seed 1": ["config.yaml:3", "'queries.mincos'", "'min_cos'"],
     "merge empty": ["empty", "manifest.json"],
-    "reference heights.npy -o aspects": ["aspects", "no pictures"],
-    "heights.npy -o aspects": ["aspects", "holds no data set"],
+    "reference heights.npy -o maps": ["maps", "no pictures"],
+    "heights.npy -o maps": ["maps", "holds no data set"],
     "heights.npy -o notes.txt/below": ["notes.txt"],
 }
 # Options and keys that the schemas refuse are tested by tests/unit/test_refusals.py.
@@ -30,7 +29,6 @@ USAGE_CASES = {
     "heights.npy --effects +gloss": ["--effects", "'+gloss' is not an effect", "clearcoat"],
     "heights.npy --queries 1e12/texel": ["shards", "output.shard_queries"],
     "heights.npy --slice 4/3": ["--slice", "4/3"],
-    "verfy empty": ["verfy", "mbtf-gen verify"],
     "--queries 5": ["no material"],
     "reference heights.npy --view 5,0": ["horizon", "elevation"],
 }
@@ -42,10 +40,9 @@ def write_inputs(folder: Path) -> None:
     np.save(folder / "heights.npy", np.random.default_rng(0).random((4, 8)))
     (folder / "notes.txt").write_text("no image")
     (folder / "notes.doc").write_text("no image")
-    for name in ("aspects", "empty"):
+    for name in ("maps", "empty"):
         (folder / name).mkdir()
-    np.save(folder / "aspects/height.npy", np.zeros((8, 8)))
-    np.save(folder / "aspects/base_color.npy", np.zeros((4, 8, 3)))
+    np.save(folder / "maps/height.npy", np.zeros((8, 8)))
     (folder / "config.yaml").write_text("queries:\n  spp: 4\n  mincos: 0.2\n")
 
 
