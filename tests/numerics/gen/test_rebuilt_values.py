@@ -227,7 +227,7 @@ def normals(folder: Path) -> Array:
     return np.asarray(n / np.linalg.norm(n, axis=-1, keepdims=True))
 
 
-@pytest.mark.parametrize("columns", [8, 12, 40, 53])
+@pytest.mark.parametrize("columns", [8, 12, 27, 40, 53])
 @pytest.mark.parametrize("scale", [SCALE, -SCALE])
 def test_heights_of_the_mesh(folder: Path, columns: int, scale: float) -> None:
     """Dequantized, resampled, scaled; the maximum that touches the reference plane is the mesh's own."""

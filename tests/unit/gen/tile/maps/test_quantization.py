@@ -41,6 +41,16 @@ def test_terraces_that_are_meant_stay(values: list[int]) -> None:
     assert code_use(codes).spacing == 1.0
 
 
+@pytest.mark.parametrize("exponent", [1.0, 1.5, 2.0, 2.5, 3.0])
+def test_detail_is_never_worse_than_stored(exponent: float) -> None:
+    """From rough maps, where nothing can be gained, to smooth ones."""
+    truth = fractal(256, 256, exponent)
+    stored = np.rint(truth * 255) / 255
+    out = dequantize(stored, 1 / 255)
+    assert rms(out - truth) < 1.01 * rms(stored - truth)
+    assert rms(slopes(out) - slopes(truth)) < 1.01 * rms(slopes(stored) - slopes(truth))
+
+
 @pytest.mark.parametrize("levels", [60, 115, 200])
 @pytest.mark.parametrize("exponent", [2.5, 3.0])
 def test_terraces_of_stretched_heights_vanish(levels: int, exponent: float) -> None:
