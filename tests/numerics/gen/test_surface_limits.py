@@ -12,6 +12,7 @@ from support.scenes import direction, estimate, flat, mi, queries
 from support.surfaces import point, towards, vectors
 
 from mbtf_core.errors import PartialError
+from mbtf_gen.render.bsdf.microfacet import half_tangent2, smith
 from mbtf_gen.render.bsdf.surface import SurfaceParts
 from mbtf_gen.sampling.light_kernel import LightKernel
 
@@ -238,3 +239,29 @@ def test_a_normal_map_makes_no_energy(view: tuple[float, float], metallic: float
         got = values(bsdf, None, np.array([0.0, 0, 1]), direction(*view), 1 << 14)
         assert got.max() < 1 + 3e-3
         assert got.min() > 0.05
+
+
+@pytest.mark.parametrize("alpha", [1e-5, 1e-2, 0.3, 1.0])
+def test_masking_keeps_its_digits(alpha: float) -> None:
+    cosine = np.array([1 - 1e-6, 0.9, 0.1, 1e-3, 1e-6])
+    x = alpha**2 * (1 - cosine**2) / cosine**2
+    expected = 0.5 * np.expm1(0.5 * np.log1p(x))
+    np.testing.assert_allclose(np.array(smith(mi.Float(cosine), alpha)), expected, rtol=5e-2, atol=0)
+    np.testing.assert_allclose(np.array(smith(mi.Float(cosine[1:]), alpha)), expected[1:], rtol=1e-5)
+
+
+@pytest.mark.parametrize("cosine", [0.9999, 0.7, 0.1, 1e-2])
+def test_half_vectors_keep_the_digits_of_narrow_lobes(cosine: float) -> None:
+    """The last digit of single precision; across the plane of incidence, that over the cosine."""
+    rng = np.random.default_rng(5)
+    n = 2000
+    slope = 1e-5 * rng.normal(size=(n, 2))
+    slope[n // 2 :, 1] = 0
+    h = np.column_stack([slope, np.ones(n)]) / np.sqrt(1 + np.sum(slope**2, axis=1))[:, None]
+    wi = np.array([np.sqrt(1 - cosine**2), 0.0, cosine]).astype(np.float32).astype(np.float64)
+    wi /= np.linalg.norm(wi)
+    wo = 2 * (h @ wi)[:, None] * h - wi
+    found = np.array(half_tangent2(vectors(np.tile(wi, (n, 1))), vectors(wo)), np.float64)
+    error = np.abs(np.sqrt(found) - np.linalg.norm(slope, axis=1))
+    assert error[n // 2 :].max() < 2.5e-7
+    assert error.max() < 2.5e-7 + 1e-7 / cosine

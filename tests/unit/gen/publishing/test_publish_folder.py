@@ -12,8 +12,6 @@ from mbtf_core.errors import InputError
 from mbtf_gen.config.exchange import PublishConfig
 from mbtf_gen.publishing.publication import Publication
 
-CONFIG = PublishConfig(license="CC0-1.0", form="parquet")
-
 
 @pytest.fixture
 def shards(tmp_path: Path) -> Path:
