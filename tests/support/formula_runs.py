@@ -10,8 +10,7 @@ import numpy as np
 
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.engine.runtime import load_mitsuba
-from mbtf_gen.generation.run import unfinished
-from mbtf_gen.job import Job, planned_paths
+from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import RunPlan, reference_plan
 from support.datasets import formula
 
@@ -64,8 +63,3 @@ def listing(folder: Path) -> dict[str, bytes]:
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in folder.iterdir() if p.suffix == ".npz"}
-
-
-def left_of(job: Job, out: Path, *part: int) -> int:
-    """Paths of the shards that are not finished."""
-    return planned_paths(job, unfinished(job, out, *part))

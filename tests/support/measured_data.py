@@ -23,9 +23,9 @@ class Images:
 
     at_once = 700
 
-    def __init__(self, rows: int = 6, columns: int = 12, lights: int = 8, lowest: float = 0.05) -> None:
+    def __init__(self, rows: int = 6, columns: int = 12, lights: int = 8) -> None:
         self.rows, self.columns = rows, columns
-        self.light, self.view = direction_pairs(slice_directions("spiral", lights, lowest))
+        self.light, self.view = direction_pairs(slice_directions("spiral", lights, 0.05))
         self.left_out = 3
         self.cosine: bool | None = True
         self.calls = 0

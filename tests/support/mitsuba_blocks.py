@@ -38,16 +38,18 @@ def block(grid: HeightGrid, bsdf: dict[str, Any], folder: Path, tiles: int = 5) 
             },
         }
     }
-    half = tiles // 2
-    for i in range(-half, half + 1):
-        for j in range(-half, half + 1):
-            shift = mi.ScalarTransform4f().translate([i * unit, j * grid.aspect * unit, 0.0])
-            entries[f"tile_{i + half}_{j + half}"] = {
-                "type": "instance",
-                "to_world": shift,
-                "group": {"type": "ref", "id": "group"},
-            }
-    return entries
+    return entries | instances(unit, grid.aspect * unit, tiles // 2)
+
+
+def instances(width: float, height: float, half: int = 2) -> dict[str, Any]:
+    """Entries of a block of instances of the scene's ``group``, `half` on each side of the central one."""
+    number, shift = range(-half, half + 1), mi.ScalarTransform4f().translate
+    same = {"type": "instance", "group": {"type": "ref", "id": "group"}}
+    return {
+        f"tile_{i + half}_{j + half}": {**same, "to_world": shift([i * width, j * height, 0.0])}
+        for i in number
+        for j in number
+    }
 
 
 def mitsuba_halves(

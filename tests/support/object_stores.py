@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from mbtf_core.data.store import ObjectStore
+
 BUCKET = "bucket"
 
 
@@ -148,3 +150,12 @@ def memory_store(folder: Path) -> Iterator[str]:
             yield "memory://data/x"
         finally:
             files.store.clear()
+
+
+def downloaded(url: str, folder: Path) -> Path:
+    """A new local copy of everything in a store."""
+    store = ObjectStore(url)
+    folder.mkdir()
+    for name in store.list():
+        (folder / name).write_bytes(store.read(name))
+    return folder

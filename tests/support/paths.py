@@ -1,4 +1,4 @@
-"""Folders of the project and of optional inputs beside it."""
+"""Folders of the project."""
 
 from __future__ import annotations
 
@@ -6,5 +6,3 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 ASSETS = ROOT / "assets"
-# Texture sets that lie beside a checkout on some machines; tests that need them skip where they are missing.
-SHARED = ROOT.parent / "shared"

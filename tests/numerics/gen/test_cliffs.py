@@ -94,8 +94,7 @@ def test_tile_mean_is_reciprocal(relief: HeightGrid) -> None:
 
 
 def test_grazing_light_and_view_stay_finite(relief: HeightGrid) -> None:
-    """Cosines down to 1e-4 on both sides: finite, nonnegative, and at most a few times albedo/π over the
-    cosine of the light."""
+    """Cosines down to 1e-4 on both sides: in [0, a few times albedo/π over the cosine of the light]."""
     n = 600
     rng = np.random.default_rng(6)
     cosine = 10 ** rng.uniform(-4, 0, (2, n))

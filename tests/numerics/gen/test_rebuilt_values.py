@@ -104,7 +104,7 @@ def slopes(z: Array) -> Array:
     return np.stack([along_u, along_v], -1)
 
 
-def residual(n: Array, z: Array) -> Array:
+def residual(n: Array, z: Array, absolute: bool = False) -> Array:
     t = -n[..., :2] / np.maximum(n[..., 2:], 0.05)
     (rows, columns), (h, w) = z.shape, n.shape[:2]
     m = slopes(z)
@@ -112,7 +112,7 @@ def residual(n: Array, z: Array) -> Array:
     dj, di = math.ceil(h / rows), math.ceil(w / columns)
     inner = (slice(dj, h - dj), slice(di, w - di)) if min(h - 2 * dj, w - 2 * di) > 0 else ()
     c = max(0.0, float(np.sum(m[inner] * t[inner]) / np.sum(m[inner] ** 2)))
-    return t - min(c, 1.0) * m
+    return t - (1.0 if absolute else min(c, 1.0)) * m
 
 
 class Surface:
@@ -227,7 +227,7 @@ def normals(folder: Path) -> Array:
     return np.asarray(n / np.linalg.norm(n, axis=-1, keepdims=True))
 
 
-@pytest.mark.parametrize("columns", [8, 12, 40, 53])
+@pytest.mark.parametrize("columns", [8, 12, 27, 40, 53])
 @pytest.mark.parametrize("scale", [SCALE, -SCALE])
 def test_heights_of_the_mesh(folder: Path, columns: int, scale: float) -> None:
     """Dequantized, resampled, scaled; the maximum that touches the reference plane is the mesh's own."""
@@ -237,13 +237,16 @@ def test_heights_of_the_mesh(folder: Path, columns: int, scale: float) -> None:
     assert np.abs(job.material.grid.z - mesh(stored(folder), columns, scale)).max() > 1e-4
 
 
+@pytest.mark.parametrize("scale", [0.3 * SCALE, SCALE])
 @pytest.mark.parametrize("columns", [8, 12, 40])
-def test_slopes_that_shading_adds(folder: Path, columns: int) -> None:
-    job = job_of(folder / "matte.yaml", columns)
+def test_slopes_that_shading_adds(folder: Path, columns: int, scale: float) -> None:
+    """Of a map that repeats more than the slopes of the mesh, or less."""
+    job = job_of(folder / "matte.yaml", columns, scale=scale)
     found = job.material.normal_slopes(job.config.effects.normal)
-    assert found is not None
     assert found[1] > 0.1
-    np.testing.assert_allclose(found[0], residual(normals(folder), job.material.grid.z), atol=1e-5)
+    n, z = normals(folder), job.material.grid.z
+    np.testing.assert_allclose(found[0], residual(n, z), atol=1e-5)
+    np.testing.assert_allclose(job.material.normal_slopes("absolute")[0], residual(n, z, True), atol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["matte", "glossy"])

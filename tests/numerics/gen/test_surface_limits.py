@@ -12,6 +12,7 @@ from support.scenes import direction, estimate, flat, mi, queries
 from support.surfaces import point, towards, vectors
 
 from mbtf_core.errors import PartialError
+from mbtf_gen.render.bsdf.microfacet import half_tangent2, smith
 from mbtf_gen.render.bsdf.surface import SurfaceParts
 from mbtf_gen.sampling.light_kernel import LightKernel
 
@@ -90,8 +91,7 @@ def test_polished_dielectric_mirrors_and_scatters_the_rest() -> None:
 @pytest.mark.parametrize("kind", ["metallic", "specular", "clearcoat"])
 @pytest.mark.parametrize("width", [0.05, 0.2, 1.0])
 def test_value_is_continuous_from_a_mirror_on(kind: str, width: float) -> None:
-    """The mirror below roughness 0.00316 and the lobe above it do not differ, even at the mirrored
-    direction under a light narrower than the sun."""
+    """The mirror is below a roughness of 0.00316; seen where it reflects a light narrower than the sun."""
     light = LightKernel(width)
     omega_o = towards(np.array([0.95, 0.5, 0.2, 0.05]), 10.0)
     omega_i = mirrored(omega_o)
@@ -105,8 +105,7 @@ def test_value_is_continuous_from_a_mirror_on(kind: str, width: float) -> None:
 
 
 def smeared(alpha: float, light: LightKernel, omega_i: Array, cosine: float) -> float:
-    """White metal at the mirrored direction: its lobe under a light, by quadrature over facet slopes in
-    double precision. Masking is neglected, which narrow lobes permit at such views."""
+    """White metal at the mirrored direction by quadrature over facet slopes; narrow lobes need no masking."""
     x, w = np.polynomial.legendre.leggauss(120)
     t, phi = np.meshgrid(0.5 * (x + 1), np.pi * (x + 1), indexing="ij")
     tangent = alpha * t / (1 - t)
@@ -240,3 +239,29 @@ def test_a_normal_map_makes_no_energy(view: tuple[float, float], metallic: float
         got = values(bsdf, None, np.array([0.0, 0, 1]), direction(*view), 1 << 14)
         assert got.max() < 1 + 3e-3
         assert got.min() > 0.05
+
+
+@pytest.mark.parametrize("alpha", [1e-5, 1e-2, 0.3, 1.0])
+def test_masking_keeps_its_digits(alpha: float) -> None:
+    cosine = np.array([1 - 1e-6, 0.9, 0.1, 1e-3, 1e-6])
+    x = alpha**2 * (1 - cosine**2) / cosine**2
+    expected = 0.5 * np.expm1(0.5 * np.log1p(x))
+    np.testing.assert_allclose(np.array(smith(mi.Float(cosine), alpha)), expected, rtol=5e-2, atol=0)
+    np.testing.assert_allclose(np.array(smith(mi.Float(cosine[1:]), alpha)), expected[1:], rtol=1e-5)
+
+
+@pytest.mark.parametrize("cosine", [0.9999, 0.7, 0.1, 1e-2])
+def test_half_vectors_keep_the_digits_of_narrow_lobes(cosine: float) -> None:
+    """The last digit of single precision; across the plane of incidence, that over the cosine."""
+    rng = np.random.default_rng(5)
+    n = 2000
+    slope = 1e-5 * rng.normal(size=(n, 2))
+    slope[n // 2 :, 1] = 0
+    h = np.column_stack([slope, np.ones(n)]) / np.sqrt(1 + np.sum(slope**2, axis=1))[:, None]
+    wi = np.array([np.sqrt(1 - cosine**2), 0.0, cosine]).astype(np.float32).astype(np.float64)
+    wi /= np.linalg.norm(wi)
+    wo = 2 * (h @ wi)[:, None] * h - wi
+    found = np.array(half_tangent2(vectors(np.tile(wi, (n, 1))), vectors(wo)), np.float64)
+    error = np.abs(np.sqrt(found) - np.linalg.norm(slope, axis=1))
+    assert error[n // 2 :].max() < 2.5e-7
+    assert error.max() < 2.5e-7 + 1e-7 / cosine

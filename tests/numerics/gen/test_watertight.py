@@ -20,8 +20,7 @@ RESOLUTION = 64
 def faults(
     grid: HeightGrid, uv: NDArray[np.float64], direction: NDArray[np.float64], tracer: Tracer
 ) -> tuple[int, int]:
-    """Rays through uv (n, 2) of the reference plane along `direction` (n, 3) that hit nothing, and those that
-    hit the surface from below."""
+    """Rays through uv (n, 2) along `direction` (n, 3) that hit nothing, and that hit from below."""
     tile = build_scene(replace(grid, tracer=tracer), lambert(0.5))
     plane = np.column_stack([(uv - 0.5) * (1.0, grid.aspect) * tile.unit, np.zeros(len(uv))])
     origin = plane - direction * (CLEARANCE / -direction[:, 2:])

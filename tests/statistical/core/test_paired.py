@@ -84,8 +84,7 @@ def test_noise_free_mse() -> None:
 
 
 def test_weighted_queries_are_those_of_the_distribution() -> None:
-    """Queries drawn three times as wide, with the ratio of densities as their weights: the truth is that of
-    the narrow distribution, and error bars are honest."""
+    """Queries drawn three times as wide, with the ratio of densities as their weights."""
 
     def experiment(estimate: Callable[[Floats, Floats, Floats, Floats], Estimate]) -> Experiment:
         def weighted(rng: np.random.Generator) -> Estimate:

@@ -69,7 +69,6 @@ def skewed() -> tuple[Queries, Allocation]:
 def test_values_of_a_skewed_scene_are_unbiased(skewed: tuple[Queries, Allocation]) -> None:
     q, allocation = skewed
     e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, 512), Stream(1, "train", 0), allocation)
-    assert e.spp is not None
     assert len(np.unique(e.spp)) > 3
     a, b = e.value_a[:, 0].astype(np.float64), e.value_b[:, 0].astype(np.float64)
     assert t_test(mean_estimate(0.5 * (a + b)), TRUTH).p_value > 1e-3
@@ -105,8 +104,6 @@ def test_a_group_has_the_paths_of_its_noisiest_query(skewed: tuple[Queries, Allo
     alone, shared = (
         estimate_shard(FewBrightPaths(), some, 4, Target(0.2, 512), stream, allocation, n) for n in (1, 4)
     )
-    assert alone.spp is not None
-    assert shared.spp is not None
     expected = alone.spp.reshape(4, -1).max(axis=0)
     assert (shared.spp.reshape(4, -1) == expected).all()
     assert expected.min() < expected.max()
@@ -116,14 +113,12 @@ def test_a_group_has_the_paths_of_its_noisiest_query(skewed: tuple[Queries, Allo
 def test_a_skewed_scene_comes_near_its_target_and_what_is_reported_is_so(
     most: int, low: float, high: float, skewed: tuple[Queries, Allocation]
 ) -> None:
-    """Also what a cap leaves: rare bright paths increase the value itself, so relative errors would rarely
-    exceed one."""
+    """Also what a cap leaves, although rare bright paths increase the value itself."""
     q, allocation = skewed
     e = estimate_shard(FewBrightPaths(), q, 4, Target(0.2, most), Stream(1, "train", 0), allocation)
     value = 0.5 * (e.value_a[:, 0].astype(np.float64) + e.value_b[:, 0])
     error = float(np.sqrt(np.mean((value - TRUTH) ** 2))) / TRUTH
     assert low < error < high
-    assert e.target is not None
     assert np.sqrt(e.target.square) == pytest.approx(error, rel=0.2)
     # What the pilot expects of a path is its root mean square deviation.
     s = allocation.deviation(q)
@@ -144,7 +139,6 @@ def test_the_error_reached_is_the_target(config: GeneratorConfig, tmp_path: Path
     found = generate(config, tmp_path / "out")
     data = Dataset.open(tmp_path / "out").load("train")
     a, b, spp = data["value_a"], data["value_b"], data["spp"]
-    assert found.target is not None
     # Counts are rounded up and low-discrepancy points do better than the pilot's single paths say.
     assert 0.03 < found.target["reached"] < 0.06
     assert spp.max() <= 256
@@ -216,24 +210,9 @@ def test_counts_ignore_launches_and_threads(kind: str, config: GeneratorConfig, 
     finally:
         dr.set_thread_count(before)
     one = found[0]
-    assert one.spp is not None
     assert len(np.unique(one.spp)) > 3
     for other in found[1:]:
         assert (other.spp == one.spp).all()
         assert (other.value_a == one.value_a).all()
         assert (other.value_b == one.value_b).all()
         assert other.target == one.target
-
-
-def test_images_and_transmittance_keep_their_shape(tmp_path: Path) -> None:
-    rng = np.random.default_rng(4)
-    np.save(tmp_path / "height.npy", rng.random((8, 8)))
-    np.save(tmp_path / "opacity.npy", (rng.random((8, 8)) > 0.3).astype(np.float32))
-    queries = {"train": "256", "test": "64", "test_spp": 4, "layout": "image", "target_error": "10%"}
-    sections = {"geometry": {"height_scale": 0.02}, "queries": queries}
-    config = GeneratorConfig.model_validate({"material": str(tmp_path), **sections})
-    generate(config, tmp_path / "out")
-    data = Dataset.open(tmp_path / "out").load("train")
-    assert data["spp"].shape == data["transmittance"].shape == data["value_a"].shape[:-1] == (4, 8, 8)
-    assert 0.1 < data["transmittance"].mean() < 0.5
-    assert data["spp"].min() >= 2

@@ -48,10 +48,7 @@ def lambert(height: NDArray[np.float64], scale: float, **more: Any) -> HeightFie
 
 
 def estimates(job: Job, plan: EffectsPlan, spp: int = 8) -> Estimates:
-    found: Estimates = build_estimator(job, plan).estimate(
-        pilot_queries(job, QUERIES), spp, Stream(1, "test", 0)
-    )
-    return found
+    return build_estimator(job, plan).estimate(pilot_queries(job, QUERIES), spp, Stream(1, "test", 0))
 
 
 def tilted(rows: int, columns: int) -> NDArray[np.float32]:
@@ -94,7 +91,6 @@ def test_bias_bounds_equal_the_rendered_change(shape: tuple[int, int]) -> None:
     plan = plan_effects(job)
     queries = pilot_queries(job, QUERIES)
     mapped = job.material.normal_slopes()
-    assert mapped is not None
     light_and_view = (w.astype(np.float64) for w in (queries.omega_i, queries.omega_o))
     bounds = displacement_bounds(
         job.material.grid, *light_and_view, LightKernel(0.0), base[..., None], mapped[0]
@@ -109,24 +105,6 @@ def test_bias_bounds_equal_the_rendered_change(shape: tuple[int, int]) -> None:
         assert bound == pytest.approx(measured, rel=0.3), name
     measured = Change.of(estimates(job, plan), estimates(job, without(plan, "normal"))).rms
     assert bounds.normal == pytest.approx(measured, rel=0.3)
-
-
-def test_the_change_is_relative_to_the_mean_and_free_of_noise() -> None:
-    rng = np.random.default_rng(0)
-    n = 20_000
-
-    def values(shift: float, noise: float) -> Estimates:
-        a, b = (0.5 + shift + noise * rng.normal(size=(n, 3)).astype(np.float32) for _ in range(2))
-        return Estimates(a.astype(np.float32), b.astype(np.float32), None, n, 0, 0, 0)
-
-    found = Change.of(values(0.0, 0.1), values(0.05, 0.1))
-    cost, upper = found.rms, found.upper
-    assert cost == pytest.approx(0.1, rel=0.05)
-    assert cost < upper < 0.12
-    found = Change.of(values(0.0, 0.1), values(0.0, 0.1))
-    cost, upper = found.rms, found.upper
-    assert cost < 0.03
-    assert upper > cost
 
 
 def test_the_tolerance_is_shared_not_spent_twice() -> None:
@@ -152,7 +130,6 @@ def test_the_bias_bound_of_holes_is_near_the_rendered_change() -> None:
     found = Change.of(estimates(job, plan, 32), estimates(job, without(plan, "opacity"), 32)).rms
     stated = plan_effects(finest_job(stuff, "auto"))["opacity"]
     assert stated.on
-    assert stated.bias_bound is not None
     assert found < stated.bias_bound < 1.6 * found
 
 
@@ -197,8 +174,7 @@ def test_rare_large_changes_keep_an_effect_on(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize("spread", [0.5, 1.0, 1.5])
 def test_bounds_hold_for_heavy_tails(spread: float) -> None:
-    """Lognormal changes: in at most 5 of 100 samples the bound lies below the true value. Two standard errors
-    alone fail in one of nine."""
+    """Lognormal changes: in at most 5 of 100 samples the bound lies below the true value."""
     rng = np.random.default_rng(2)
     one = np.ones((2000, 3), np.float32)
     scale = 0.01

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.formula_runs import Formula
 
 from mbtf_core.data.schema import Queries
 from mbtf_core.files.atomic import write_checksummed
@@ -19,9 +20,9 @@ from mbtf_gen.generation import run as generation
 from mbtf_gen.generation.run import generate
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects_plan import EffectsPlan, without
-from mbtf_gen.planning.run_plan import RunPlan, plan_effects
+from mbtf_gen.planning.run_plan import plan_effects
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
-from mbtf_gen.render.estimates import Estimates, Stream
+from mbtf_gen.render.estimates import Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 load_mitsuba()
@@ -85,29 +86,6 @@ def test_the_closed_form_is_the_color_over_pi() -> None:
     np.testing.assert_allclose(traced.value_a, found.value_a, rtol=1e-5)
 
 
-class Recorder:
-    """Replaces the estimator and records the plans it was built for."""
-
-    def __init__(self) -> None:
-        self.plans: list[EffectsPlan] = []
-
-    def build(self, job: Job, plan: EffectsPlan) -> Recorder:
-        self.plans.append(plan)
-        return self
-
-    def estimate(self, queries: Queries, spp: int, stream: Stream, **_: Any) -> Estimates:
-        value = np.zeros((len(queries.sigma), 3), np.float32)
-        through = queries.u[:, 0].astype(np.float32)
-        return Estimates(value, value, through, len(value) * spp, 0, 0, 0)
-
-
-@pytest.fixture
-def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
-    found = Recorder()
-    monkeypatch.setattr(generation, "build_estimator", found.build)
-    return found
-
-
 @pytest.fixture
 def config(tmp_path: Path) -> GeneratorConfig:
     np.save(tmp_path / "height.npy", noise(4, 8))
@@ -117,23 +95,20 @@ def config(tmp_path: Path) -> GeneratorConfig:
 
 
 def test_resumed_and_sliced_runs_follow_the_plan_of_the_manifest(
-    config: GeneratorConfig, recorder: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: GeneratorConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The plan of the manifest applies, even where another machine would choose another one."""
+    plans: list[EffectsPlan] = []
+    monkeypatch.setattr(generation, "build_estimator", lambda job, plan: plans.append(plan) or Formula())
     out = tmp_path / "out"
     generate(config, out, slice_index=1, slice_count=2)
-    first = recorder.plans[-1]
     manifest = json.loads((out / "manifest.json").read_text())
-    stored = replace(first, max_depth=7, roulette_depth=5)
+    stored = replace(plans[-1], max_depth=7, roulette_depth=5)
     manifest["effects"] = stored.to_manifest()
     write_checksummed(out / "manifest.json", manifest)
-
-    def never(*_: Any) -> RunPlan:
-        raise AssertionError("planned again although the manifest has a plan")
-
-    monkeypatch.setattr("mbtf_gen.generation.run.plan_run", never)
+    monkeypatch.setattr(generation, "plan_run", None)
     generate(config, out, slice_index=2, slice_count=2)
-    assert recorder.plans[-1] == stored
+    assert plans[-1] == stored
     assert json.loads((out / "manifest.json").read_text())["effects"] == stored.to_manifest()
 
 

@@ -64,8 +64,7 @@ def test_roulette_leaves_direct_light_alone(albedo: float, width: float) -> None
 def tile_mean(
     grid: HeightGrid, bsdf: Any, omega_i: NDArray[np.float64], omega_o: NDArray[np.float64], seed: int
 ) -> Estimate:
-    """Tile mean over independent positions; its error includes the variance between positions and the noise
-    of the paths."""
+    """Tile mean over independent positions; its error has their variance and the noise of the paths."""
     q = tile_mean_queries(omega_i, omega_o, 30_000, seed)
     e = estimate(grid, bsdf, LightKernel(0.0), q, 16, seed=seed)
     v = 0.5 * (e.value_a + e.value_b)[:, 0].astype(np.float64)

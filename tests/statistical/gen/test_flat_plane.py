@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,6 @@ from numpy.typing import NDArray
 from support.scenes import direction, estimate, flat, mi, queries
 
 from mbtf_core.stats import mean_of_halves, t_test
-from mbtf_gen import Camera, GeneratorConfig, render_reference
 from mbtf_gen.sampling.light_kernel import LightKernel
 
 
@@ -63,14 +61,3 @@ def test_glossy_kernel_average(description: dict[str, Any], width: float, light:
     mean = mean_of_halves(e.value_a[:, 0], e.value_b[:, 0])
     assert mean.relative_error < 1e-2
     assert t_test(mean, expected).p_value > 1e-4
-
-
-def test_a_picture_of_a_lambert_plane_is_its_albedo(tmp_path: Path) -> None:
-    """From a configuration alone: albedo 0.5, so that every pixel shows 0.5/π."""
-    np.save(tmp_path / "height.npy", np.zeros((8, 8), np.float32))
-    camera = Camera(elevation=40.0, rows=12, columns=16)
-    image = render_reference(GeneratorConfig(material=tmp_path), camera, [0.0, 0.6, 0.8], spp=16)
-    assert image.value.shape == (12, 16, 3)
-    mean = mean_of_halves(image.value_a[..., 0].ravel(), image.value_b[..., 0].ravel())
-    assert mean.relative_error < 5e-3
-    assert t_test(mean, 0.5 / np.pi).p_value > 1e-4

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.gltf_files import SQUARE, SQUARE_UV, GltfBuilder
-from support.mitsuba_blocks import SPP, mitsuba_halves, random_queries
+from support.mitsuba_blocks import SPP, instances, mitsuba_halves, random_queries
 from support.scenes import (
     Estimator,
     LightKernel,
@@ -44,7 +44,6 @@ def load(builder: GltfBuilder, folder: Path) -> MeshTile:
     builder.write(folder / "a.glb")
     (folder / "material.yaml").write_text("mesh: a.glb\nperiod: [1, 1]\n")
     tile = load_material(folder)
-    assert isinstance(tile, MeshTile)
     return tile
 
 
@@ -65,26 +64,17 @@ def ply(path: Path, vertices: NDArray[Any], uv: NDArray[Any], bsdf: dict[str, An
         + "".join(" ".join(f"{x:.9g}" for x in row) + "\n" for row in rows)
         + "".join(f"3 {a} {a + 1} {a + 2}\n3 {a} {a + 2} {a + 3}\n" for a in range(0, 4 * count, 4))
     )
-    return {
-        "type": "ply",
-        "filename": str(path),
-        "face_normals": True,
-        "bsdf": {"type": "twosided", "nested": bsdf},
-    }
+    both = {"type": "twosided", "nested": bsdf}
+    return {"type": "ply", "filename": str(path), "face_normals": True, "bsdf": both}
 
 
 def bitmap(pixels: NDArray[Any], wrap: str) -> dict[str, Any]:
-    return {
-        "type": "bitmap",
-        "bitmap": mi.Bitmap(np.ascontiguousarray(pixels, np.float32)),
-        "raw": True,
-        "wrap_mode": wrap,
-    }
+    image = mi.Bitmap(np.ascontiguousarray(pixels, np.float32))
+    return {"type": "bitmap", "bitmap": image, "raw": True, "wrap_mode": wrap}
 
 
 def test_mitsuba_agrees_on_a_file_of_many_features(tmp_path: Path) -> None:
-    """A floor whose texture is turned and mirrored, by a second set of quantized coordinates; golden fins,
-    quantized and of several nodes, whose roughness varies."""
+    """A floor of turned, mirrored, second texture coordinates; quantized golden fins of several nodes."""
     rng = np.random.default_rng(3)
     codes, gloss = rng.integers(0, 256, (4, 5, 3), np.uint8), rng.integers(60, 160, (3, 2, 3), np.uint8)
     builder = GltfBuilder()
@@ -124,32 +114,14 @@ def test_mitsuba_agrees_on_a_file_of_many_features(tmp_path: Path) -> None:
         turned_fin = [a * np.cos(angle) + d * np.sin(angle), b, -a * np.sin(angle) + d * np.cos(angle)]
         fins.append(np.add(np.column_stack(turned_fin), (x, 0.05, z)))
     green, blue = (gloss[..., k : k + 1] / 255.0 for k in (1, 2))
-    metal = {
-        "type": "mbtf_surface",
-        "base_color": {"type": "rgb", "value": list(GOLD)},
-        "specular": 0.5,
-        "roughness": bitmap(green, "repeat"),
-        "metallic": bitmap(blue, "repeat"),
-    }
+    metal = {"type": "mbtf_surface", "base_color": {"type": "rgb", "value": list(GOLD)}, "specular": 0.5}
+    metal |= {"roughness": bitmap(green, "repeat"), "metallic": bitmap(blue, "repeat")}
     diffuse = {"type": "diffuse", "reflectance": bitmap(linear, "mirror")}
     down = np.array([0, DEPTH, 0])
-    scene: dict[str, Any] = {
-        "group": {
-            "type": "shapegroup",
-            "floor": ply(tmp_path / "floor.ply", SQUARE - down, placed, diffuse),
-            "fins": ply(
-                tmp_path / "fins.ply", np.vstack(fins) - down, np.tile(SQUARE_UV, (len(FINS), 1)), metal
-            ),
-        }
-    }
-    for i in range(-2, 3):
-        for j in range(-2, 3):
-            shift = mi.ScalarTransform4f().translate([i * LONG_SIDE, j * LONG_SIDE, 0.0])
-            scene[f"tile_{i + 2}_{j + 2}"] = {
-                "type": "instance",
-                "to_world": shift,
-                "group": {"type": "ref", "id": "group"},
-            }
+    plates = ply(tmp_path / "fins.ply", np.vstack(fins) - down, np.tile(SQUARE_UV, (len(FINS), 1)), metal)
+    floor = ply(tmp_path / "floor.ply", SQUARE - down, placed, diffuse)
+    scene: dict[str, Any] = {"group": {"type": "shapegroup", "floor": floor, "fins": plates}}
+    scene |= instances(LONG_SIDE, LONG_SIDE)
     omega_i = direction(40, 70)
     q = random_queries(4096, 0.01, omega_i)
     a, b = mitsuba_halves(scene, directional(omega_i), q, 1.0, 3)
@@ -177,9 +149,8 @@ def test_holes_of_a_plate_are_the_transmittance(mode: str, share: float, tmp_pat
         base["baseColorFactor"][3] = 1
     builder.plate(builder.material(base, alphaMode=mode, extensions=LAMBERT))
     # A second part, below all holes, of which the tile mean shows what the holes let through.
-    builder.node(
-        builder.mesh(SQUARE * (0.5, 1, 1), material=builder.material({"baseColorFactor": [0, 0, 0, 1]}))
-    )
+    black = builder.material({"baseColorFactor": [0, 0, 0, 1]})
+    builder.node(builder.mesh(SQUARE * (0.5, 1, 1), material=black))
     builder.document["nodes"][1]["translation"] = [0, -0.01, 0]
     tile = load(builder, tmp_path)
     up = np.array([0.0, 0.0, 1.0])

@@ -57,9 +57,7 @@ def truth() -> dict[str, float]:
 def plane() -> Highlights:
     """Highlights of the plane, from a pilot of its values."""
     pilot = PLAN.draw("pilot", 0, 8192)
-    found = fit_highlights(pilot, value_of(pilot))
-    assert found is not None
-    return found
+    return fit_highlights(pilot, value_of(pilot))
 
 
 def drawn(highlights: Highlights) -> tuple[Queries, F64]:
@@ -121,8 +119,7 @@ def test_probabilities_of_selection() -> None:
 
 
 def test_a_rendered_test_set_has_the_error_of_a_plain_one(tmp_path: Path) -> None:
-    """From the pilot to the file: means of M and the error of a model agree between both test sets, and one
-    by highlights resolves the error far better."""
+    """Means and errors of a model agree, and the test set by highlights resolves the error far better."""
     np.save(tmp_path / "height.npy", 0.02 * np.random.default_rng(0).random((8, 8)))
     text = "height: height.npy\nbase_color: 0.8\nmetallic: 1\nroughness: 0.4\n"
     (tmp_path / "material.yaml").write_text(text)

@@ -73,7 +73,6 @@ def test_values_have_the_same_mean_and_the_same_variance(tile: TileScene, groups
     a1, b1, a2, b2 = halves
     assert t_test(mean_estimate((a1 - b1) ** 2 - (a2 - b2) ** 2)).p_value > 1e-3
     if alone.transmittance is not None:
-        assert shared.transmittance is not None
         # Every light of a group sees what passes the same rays.
         assert (shared.transmittance.reshape(LIGHTS, -1) == shared.transmittance[:GROUPS]).all()
         assert t_test(mean_estimate(alone.transmittance - shared.transmittance)).p_value > 1e-3
@@ -143,12 +142,4 @@ def test_values_do_not_depend_on_launches_and_numbers_of_paths_differ_by_group(g
         one, other = (getattr(e, name) for e in found)
         assert np.array_equal(one, other)
     assert found[0].paths == counts.sum() / LIGHTS
-    assert found[0].spp is not None
     assert np.array_equal(found[0].spp, counts)
-
-
-def test_queries_of_a_group_have_equal_numbers_of_paths(groups: Queries) -> None:
-    estimator = Estimator(scene("heights"), LightKernel(3.0), Transport())
-    counts = np.repeat([2, 4], LIGHTS * GROUPS // 2)
-    with pytest.raises(ValueError, match="groups of 4 with equal numbers"):
-        estimator.estimate(groups, counts, Stream(1, "train", 0), lights=LIGHTS)

@@ -97,8 +97,7 @@ def test_surfaces_under_sheen_return_at_most_what_they_receive() -> None:
     ("roughness", "cosine"), [(0.1, 0.1), (0.1, 0.5), (0.3, 1e-2), (0.45, 1.0), (1.0, 0.1), (1.0, 0.5)]
 )
 def test_sheen_takes_from_the_base_what_it_reflects(roughness: float, cosine: float) -> None:
-    """Against a quadrature of the published model: D of Estevez and Kulla 2017 with Smith masking. The base
-    receives the smaller remainder of the two directions, of view and light."""
+    """Against a quadrature of D of Estevez and Kulla 2017 with Smith masking."""
     x, w = np.polynomial.legendre.leggauss(160)
     t, phi = np.meshgrid(0.5 * (x + 1), 0.5 * np.pi * (x + 1), indexing="ij")
     mu = t**2
@@ -235,8 +234,7 @@ def test_without_gloss_it_is_mitsubas_diffuse() -> None:
 
 @pytest.mark.parametrize("roughness", [0.05, 0.1, 0.2, 0.3])
 def test_narrow_metal_lobe_is_mitsubas_roughconductor(roughness: float) -> None:
-    """At low roughness the masking model hardly matters (Mitsuba's G is a product). Multiple scattering is at
-    most 3e-3 of the peak."""
+    """At low roughness the masking model hardly matters (Mitsuba's G is a product)."""
     rng = np.random.default_rng(8)
     wi = towards(rng.uniform(0.5, 1, 2000), 360 * rng.random(2000))
     alpha = roughness**2
@@ -257,8 +255,7 @@ def test_narrow_metal_lobe_is_mitsubas_roughconductor(roughness: float) -> None:
 
 
 def test_metal_gives_back_what_one_scattering_loses() -> None:
-    """Kulla and Conty 2017: of the energy lost by single scattering, Fms = F̄ (F̄ Ā + F̄² (1-Ā) Ā + …) is
-    returned."""
+    """Kulla and Conty 2017: of the energy lost at first, F̄ (F̄ Ā + F̄² (1-Ā) Ā + …) is returned."""
     roughness, cosine = 1.0, 0.7
     x, w = np.polynomial.legendre.leggauss(160)
     mu, phi = np.meshgrid(0.5 * (x + 1), 0.5 * np.pi * (x + 1), indexing="ij")

@@ -21,8 +21,6 @@ from support.scenes import (
     tile_mean_queries,
 )
 
-from mbtf_core.stats import mean_of_halves
-
 MIRROR = {"type": "conductor", "material": "none"}
 # A trough along y: walls one tile width high, the floor between them flat.
 TROUGH = HeightGrid(np.tile([0.0, -1.0, -1.0, -1.0], (4, 1)), 1.0)
@@ -101,14 +99,3 @@ def test_a_low_cap_darkens_and_is_counted() -> None:
     # The same paths, some of them dark.
     assert np.all(cut.value_a <= full.value_a + 1e-6)
     assert cut.value_a.mean() < 0.9 * full.value_a.mean()
-
-
-def test_white_furnace_of_a_deep_trough() -> None:
-    """Paths of more bounces than the roulette depth conserve energy."""
-    trough = HeightGrid(4.0 * TROUGH.z, 1.0)
-    q = tile_mean_queries([0, 0, 1], direction(80, 0), 20_000)
-    e = estimate(trough, lambert(1.0), None, q, 16)
-    mean = mean_of_halves(e.value_a[:, 0], e.value_b[:, 0])
-    assert mean.error < 5e-4
-    assert abs(mean.value - 1.0) < 5 * mean.error
-    assert e.capped == 0

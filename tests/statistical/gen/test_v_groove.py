@@ -40,8 +40,7 @@ def footprint_mean(
 @pytest.mark.parametrize("count", [1, 1024])
 @pytest.mark.parametrize(("light", "view"), PAIRS)
 def test_tile_mean(light: tuple[float, float], view: tuple[float, float], count: int) -> None:
-    """Fine grooves have the mean of a large one. A ray offset of 5e-5 tile widths, Mitsuba's own, would lift
-    rays out of them."""
+    """Fine grooves have the mean of a large one."""
     omega_i, omega_o = direction(*light), direction(*view)
     expected = GROOVE.tile_mean(omega_i, omega_o)
     e = estimate(

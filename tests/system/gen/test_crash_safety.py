@@ -193,17 +193,19 @@ def test_a_kill_at_any_file_operation_loses_nothing(name: str, thorough: bool, s
 
 def test_a_sidecar_is_removed_before_its_shard_is_replaced(small: Small) -> None:
     """The shard is gone, its sidecar not: it goes before another shard takes the name."""
-    small.corrupt()
-    (small.out / "train-00001.npz").unlink()
-    with FileOperations(small.out) as watch:
-        assert generate(["repair", str(small.out), "-q"]) == 0
-    for stem in ("train-00000", "train-00001"):
-        order = [
-            watch.seen.index(("unlink", f"{stem}.json", 1)),
-            watch.seen.index(("replace", f".{stem}.npz.tmp", 1)),
-            watch.seen.index(("replace", f".{stem}.json.tmp", 1)),
-        ]
-        assert order == sorted(order)
+    repaired, kept = ["repair", str(small.out), "-q"], small.line
+    for prepare, line, stems in ((small.corrupt, repaired, (0, 1)), (small.unmerged, kept, (1,))):
+        prepare()
+        (small.out / "train-00001.npz").unlink()
+        with FileOperations(small.out) as watch:
+            assert generate(line) == 0
+        for stem in (f"train-0000{number}" for number in stems):
+            order = [
+                watch.seen.index(("unlink", f"{stem}.json", 1)),
+                watch.seen.index(("replace", f".{stem}.npz.tmp", 1)),
+                watch.seen.index(("replace", f".{stem}.json.tmp", 1)),
+            ]
+            assert order == sorted(order)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

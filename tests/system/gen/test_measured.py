@@ -19,9 +19,6 @@ LINES = {
     "verify": "verify felt",
     "zip": "import photographs.zip --cosine excluded --queries 300 -o photographs",
     "folder": "import folder --cosine excluded --queries 300 -o photographs_of_folder",
-    "silent": "import photographs.zip -o silent",
-    "no format": "import text.btf -o none",
-    "missing": "import missing.btf -o none",
     "generate": f"wool {SMALL} --queries 20/texel -o shuffled",
     "slices": f"wool {SMALL} --queries 81/texel --layout slices -o slices",
     "to neumip": "export shuffled shuffled.hdf5",
@@ -39,7 +36,6 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "felt.btf").write_bytes(btf())
     (folder / "photographs.zip").write_bytes(zipped(photographs()))
     write_folder(folder / "folder", photographs())
-    (folder / "text.btf").write_text("!not a BTF")
     (folder / "wool").mkdir()
     heights = np.random.default_rng(0).random((8, 8)).astype(np.float32)
     np.save(folder / "wool/height.npy", heights)
@@ -56,12 +52,11 @@ def test_an_import_is_a_data_set(work: Path, done: dict[str, Done]) -> None:
     assert done["import"].result()["splits"] == {"train": 160, "test": 20}
     assert done["again"].code == done["verify"].code == 0
     assert Dataset.open(work / "felt").load("train")["value_a"].min() > 0
-    # The kind of a file is told by its content.
     for name in ("zip", "folder"):
         assert done[name].code == 0, done[name].err
 
 
-@pytest.mark.parametrize("name", ["silent", "no format", "missing", "wrong layout", "exists"])
+@pytest.mark.parametrize("name", ["wrong layout", "exists"])
 def test_what_cannot_be_used_is_refused_in_one_line(done: dict[str, Done], name: str) -> None:
     assert done[name].code != 0
     (line,) = [line for line in done[name].err.splitlines() if line.startswith("error:")]

@@ -27,21 +27,13 @@ roughness: 0.4
 metallic: heights.npy
 normal: {file: normal.npy, convention: gl}
 """
-BSDF = """\
-height: heights.npy
-bsdf:
-  type: principled
-  roughness: {type: bitmap, filename: normal.npy}
-"""
+BSDF = "height: heights.npy\nbsdf: {type: principled, roughness: {type: bitmap, filename: normal.npy}}\n"
 CONFIG = """\
 material: heights.npy
 geometry: {height_scale: 0.1, mesh: 64}
 queries:
   train: 400/texel
-  test: 1000
-  spp: 4
   mixture: {log_uniform: 1, finest: 0}
-light: {width: 1.0}
 seed: 7
 """
 FIT = """\
@@ -73,21 +65,7 @@ DOCUMENTS: dict[str, tuple[str, Callable[[Path], Any]]] = {
 }
 # What YAML readers and validators stumble over.
 ODD = [
-    *(
-        "~",
-        "null",
-        "yes",
-        "true",
-        ".nan",
-        "-.inf",
-        ".inf",
-        "-0.0",
-        "0x1f",
-        "0o17",
-        "1e400",
-        "-1e400",
-        "1_000",
-    ),
+    *("~", "null", "yes", "true", ".nan", "-.inf", "-0.0", "0x1f", "0o17", "1e400", "1_000"),
     *("9" * 40, "9" * 5000, "2001-01-01", "2001-99-99", "12:30:45", "0b_", "._", "1e5", "-1", "0", "1.5"),
     *("[]", "{}", "[[[]]]", "[1, [2]]", "{a: {b: c}}", "!!python/name:os.system", "!!binary AAAA", "!x y"),
     *("!!int x", "!!bool x", "!!omap x", "!!set {a, b}", "!!str", "&a [*a]", "*nowhere", "<<: *x", "'", '"'),
@@ -165,24 +143,17 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x, x]\n" + "".join(
 HOSTILE = {
     "a bomb of aliases": (BOMB, "holds more than 100,000 values"),
     "indentation": ("\n".join(" " * i + "a:" for i in range(400)), "nested more than 100 levels deep"),
-    "dashes": ("a:\n" + " - " * 5000, "nested more than 100 levels deep"),
     "a flood": ("a: 1\n" * 100_000, "is too long"),
-    "a list of many": (f"a: [{'1,' * 20_000}]", "is too long"),
     "merges": (
         f"a: &a {{{', '.join(f'k{k}: 1' for k in range(1000))}}}\n"
         + "".join(f"b{k}:\n  <<: *a\n" for k in range(200)),
         "too many keys",
     ),
     "a long number": ("a: " + "9" * 5000, "not valid YAML"),
-    "a date of no calendar": ("a: 2001-99-99", "not valid YAML"),
     "a foreign object": ("a: !!python/object/apply:os.system ['true']", "holds the tag"),
-    "a tag": ("a: !mine 5", "holds the tag '!mine'"),
-    "a number as key": ("1: 2", "key 1 is not text"),
     "a list as key": ("? [a, b]\n: 1", "is not text"),
     "a key twice": ("a: 1\na: 2\n", "duplicate key"),
-    "a tab": ("a:\n\tb: 1\n", "cannot start any token"),
     "two documents": ("a: 1\n---\nb: 2\n", "another document"),
-    "a null character": ("a: \0", "control character U+0000"),
     "a list": ("- a\n", "must hold a mapping"),
 }
 
@@ -190,33 +161,9 @@ HOSTILE = {
 @pytest.mark.parametrize("case", HOSTILE)
 def test_hostile_yaml(case: str, write: Callable[[str], Path]) -> None:
     text, message = HOSTILE[case]
-    path = write(text)
     with pytest.raises(InputError) as caught:
-        read_yaml(path)
+        read_yaml(write(text))
     assert message in caught.value.what
-    loads_or_refuses(lambda: read_yaml(path))
-
-
-@pytest.mark.parametrize(
-    ("content", "line"),
-    [
-        (b"a: 1\nb: [0, [1, !mine 5]]\n", 2),
-        (b"a: 1\n\nb:\n  c: !!python/none x\n", 4),
-        (b"a: 1\n\n3: 2\n", 3),
-        (b"a: 1\nb: x\0y\n", 2),
-        ("# caf\u00e9\na: caf\u00e9\n".encode("latin-1"), 1),
-        ("a: 1\n".encode("utf-16"), 1),
-        (b"a: 1\nb: " + 101 * b"[", 2),
-        (b"a: 1\nb:\n\t- 1\n", 3),
-        (b"a: {b: 1,\n  b: 2}\n", 2),
-    ],
-)
-def test_the_line_is_named(content: bytes, line: int, tmp_path: Path) -> None:
-    path = tmp_path / "a.yaml"
-    path.write_bytes(content)
-    with pytest.raises(InputError) as caught:
-        read_yaml(path)
-    assert caught.value.where == f"{path}:{line}", caught.value.message
 
 
 @pytest.mark.parametrize("text", ["a: &a [*a]\n", "a: &a\n  b: *a\n", "&a a: {b: *a}\n"])

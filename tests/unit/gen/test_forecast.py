@@ -1,20 +1,27 @@
-"""Forecasts: bytes as written, noise as it is, seconds in proportion to the paths."""
+"""Forecasts: bytes, noise, seconds; long commands state them before they start."""
 
 from __future__ import annotations
 
 import math
 import sys
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from mbtf_core import forecast as core
+from mbtf_core.app.console import run
 from mbtf_core.data.schema import Queries
+from mbtf_core.data.shard_files import row_bytes
+from mbtf_core.files import folders
 from mbtf_gen import forecast as module
+from mbtf_gen.cli.app import app
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.forecast import forecast
-from mbtf_gen.job import Job, split_target
+from mbtf_gen.generation import run as generation
+from mbtf_gen.job import Job
 from mbtf_gen.planning import sample_allocation
 from mbtf_gen.planning.run_plan import RunPlan, allocate, plan_effects
 from mbtf_gen.planning.simulation import pilot_queries
@@ -121,17 +128,6 @@ def test_a_target_error_decides_paths_and_seconds(faked: None) -> None:
         assert found.paths == pytest.approx(1e6 * (stored + 16) + 2e4 * 64, rel=1e-3)
         assert found.seconds == pytest.approx(found.paths / RATE, rel=1e-3)
         assert found.relative_error == pytest.approx(0.8 / np.sqrt(stored) / 0.25, rel=0.1)
-        lines = found.describe(split_target(job.config, "train")).splitlines()
-        assert f"{stored:.0f} paths per training query for an error of 8.00% of" in lines[1]
-
-
-def test_a_forecast_of_slow_paths_is_short(faked: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of cloth on a busy machine."""
-    monkeypatch.setattr(sys.modules[__name__], "RATE", 5e3)
-    job = job_of(train="1000000", spp=8, test="20000", test_spp=64)
-    found = forecast(job, RunPlan(plan_effects(job, pilots=False)), seconds=1.0)
-    assert found.seconds == pytest.approx(found.paths / RATE, rel=1e-6)
-    assert module.time.now < 6.0  # type: ignore[attr-defined]
 
 
 def test_a_test_set_alone_is_forecast_from_many_paths(faked: None, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -140,3 +136,65 @@ def test_a_test_set_alone_is_forecast_from_many_paths(faked: None, monkeypatch: 
     job = job_of(train="1", spp=4, test="20000", test_spp=256)
     found = forecast(job, RunPlan(plan_effects(job, pilots=False)), seconds=0.0)
     assert found.seconds == pytest.approx(found.paths / RATE, rel=0.1)
+
+
+@pytest.fixture
+def heights(tmp_path: Path) -> Path:
+    np.save(tmp_path / "height.npy", np.random.default_rng(0).random((256, 256)))
+    return tmp_path / "height.npy"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [(), ("reference", "--size", "512"), ("preview", "--size", "1024")],
+)
+def test_what_does_not_fit_is_refused_before_anything_is_written(
+    heights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
+) -> None:
+    monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e6))
+    out = heights.parent / "out"
+    line = [*words[:1], str(heights), *words[1:], "--height-scale", "0.01", "-o", str(out)]
+    assert run(app, line) == 3
+    message = capsys.readouterr().err
+    assert "1.0 MB are free" in message
+    assert "-o" in message.splitlines()[-1]
+    assert not out.exists()
+
+
+def stop(*_: Any, **__: Any) -> Any:
+    raise KeyboardInterrupt
+
+
+def test_a_long_run_states_time_and_size(
+    heights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before the first shard, and, for a new data set, before its folder is made."""
+    out = heights.parent / "out"
+    seen: list[bool] = []
+
+    def pilot(*_: Any, **__: Any) -> Any:
+        seen.append(out.exists())
+        return SimpleNamespace(start=5.0, seconds=600.0)
+
+    monkeypatch.setattr(generation, "open_folder", lambda job, folder, plan, overwrite: stop(plan(job)))
+    monkeypatch.setattr(module, "LONG_RUN", 1)
+    monkeypatch.setattr(module, "forecast", pilot)
+    plan = SimpleNamespace(effects=SimpleNamespace(closed_form=False))
+    monkeypatch.setattr(generation, "plan_run", lambda *_: plan)
+    words = [
+        str(heights),
+        "--height-scale",
+        "0.01",
+        "--quality",
+        "draft",
+        "--resolution",
+        "64",
+        "-o",
+        str(out),
+    ]
+    assert run(app, words) == 130
+    size = f"{(400 * 64**2 + 65536) * row_bytes(holes=False) / 1e6:.0f} MB"
+    err = capsys.readouterr().err
+    assert f"resolution 64, {size}" in err
+    assert f"expected: about 10:05, {size} on disk; faster: --queries 100/texel" in err
+    assert seen == [False]

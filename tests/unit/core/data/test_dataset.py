@@ -40,26 +40,6 @@ def test_shuffled_layout(tmp_path: Path, array_format: str) -> None:
     assert np.abs(error).max() < 6 * NOISE
 
 
-@pytest.mark.parametrize("array_format", ["npz", "exr"])
-def test_images_share_direction_and_footprint(tmp_path: Path, array_format: str) -> None:
-    data = write_dataset(
-        tmp_path / "shards",
-        queries={"train": "160", "test": "32", "layout": "image"},
-        output={**OUTPUT, "format": array_format},
-    )
-    assert data.layout == "image"
-    assert data.lattice.shape() == (4, 8)
-    assert [shard.rows for shard in data.shards("train")] == [2, 2, 1]
-    arrays = data.load("train")
-    assert arrays["u"].shape == (5, 4, 8, 2)
-    for name in ("sigma", "omega_i", "omega_o"):
-        assert np.array_equal(arrays[name], np.broadcast_to(arrays[name][:, :1, :1], arrays[name].shape))
-    column = np.floor(arrays["u"][..., 0] * 8)
-    row = np.floor((1.0 - arrays["u"][..., 1]) * 4)
-    assert np.array_equal(column, np.broadcast_to(np.arange(8), (5, 4, 8)))
-    assert np.array_equal(row, np.broadcast_to(np.arange(4)[:, None], (5, 4, 8)))
-
-
 @pytest.mark.parametrize("suffix", ["npz", "json"])
 def test_missing_and_unfinished_shards(tmp_path: Path, suffix: str) -> None:
     data = write_dataset(tmp_path / "shards", queries={"train": "100", "test": "10"}, output=OUTPUT)
@@ -75,25 +55,17 @@ def test_missing_and_unfinished_shards(tmp_path: Path, suffix: str) -> None:
 def test_folders_that_hold_no_data_set(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such folder"):
         Dataset.open(tmp_path / "gone")
-    (tmp_path / "shards").mkdir()
-    (tmp_path / "shards.xy").touch()
-    with pytest.raises(InputError) as caught:
-        Dataset.open(tmp_path / "shards.x")
-    assert caught.value.hint == f"did you mean '{tmp_path / 'shards'}'?"
     with pytest.raises(InputError, match=r"no manifest\.json"):
         Dataset.open(tmp_path)
     path = tmp_path / "manifest.json"
     for text, message in (
         ("{", "not readable as JSON"),
-        ("[1]", "must hold a JSON object"),
         ('{"format": "other"}', "is not a manifest"),
         ('{"format": "mbtf-shards", "schema": 99}', "schema version 99, this program reads version 6"),
-        ('{"format": "mbtf-shards"}', "schema version None"),
     ):
         path.write_text(text)
-        with pytest.raises(InputError, match=message) as caught:
+        with pytest.raises(InputError, match=message):
             Dataset.open(tmp_path)
-        assert caught.value.exit_code == 3
 
 
 @pytest.fixture(scope="module")
@@ -121,10 +93,8 @@ def test_foreign_and_impossible_data_are_refused(
     other = runs[kind].with_name(f"{kind}-1")
     change, says = FOREIGN[name]
     change(tmp_path / "set", other, f".{kind[-3:]}")
-    with pytest.raises(InputError, match=says) as caught:
+    with pytest.raises(InputError, match=says):
         Dataset.open(tmp_path / "set").load("train")
-    assert caught.value.exit_code == 3
-    assert caught.value.hint == f"check the data set with: mbtf-gen verify {tmp_path / 'set'}"
     with pytest.raises(InputError, match=says):
         list(Dataset.open(tmp_path / "set").iterate("train"))
 
@@ -143,7 +113,5 @@ def test_images_have_one_direction_and_the_size_of_the_lattice(runs: dict[str, P
     sigma = intact["sigma"].copy()
     sigma[1, 2, 3] *= 0.5
     assert found(sigma=sigma) == "'sigma' differs between texels of an image"
-    smaller = {name: array[:, :, :4] for name, array in intact.items()}
-    assert found(**smaller) == "has 4 x 4 queries per row, manifest.json says 4 x 8"
     flat = {name: array[:, 0, 0] for name, array in intact.items()}
     assert found(**flat) == "has 1 queries per row, manifest.json says 4 x 8"

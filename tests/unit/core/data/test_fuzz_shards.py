@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -94,52 +92,6 @@ def test_an_altered_manifest_or_sidecar(data: st.DataObject, whole: Path) -> Non
         path.write_text(before)
         # Reading may have completed it.
         (whole / MANIFEST_NAME).write_text(manifest)
-
-
-def archive(members: dict[str, bytes], compression: int = zipfile.ZIP_STORED) -> bytes:
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", compression) as out:
-        for name, content in members.items():
-            out.writestr(f"{name}.npy", content)
-    return stream.getvalue()
-
-
-def npy(header: str, content: bytes = b"") -> bytes:
-    """An npy file of a header in words."""
-    text = header.encode().ljust(118) + b"\n"
-    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + content
-
-
-def header(dtype: str, shape: str) -> str:
-    return f"{{'descr': '{dtype}', 'fortran_order': False, 'shape': {shape}}}"
-
-
-CLAIMS = {
-    "more than there is": (archive({"sigma": npy(header("<f4", "(9,)"), b"\0" * 32)}), "not as long as"),
-    "less than nothing": (archive({"sigma": npy(header("<f4", "(-4,)"))}), "not as long as"),
-    "an overflow": (archive({"u": npy(header("<f4", f"({2**63}, 2)"))}), "not as long as"),
-    "objects": (archive({"sigma": npy(header("|O", "(4,)"), b"\0" * 32)}), "not C-ordered float32"),
-    "no array": (archive({"sigma": b"not an array"}), "cannot be read"),
-    "four axes": (
-        archive({"sigma": npy(header("<f4", "(2, 1, 1, 2)"), b"\0" * 16)}),
-        "has the shape (2, 1, 1, 2)",
-    ),
-    "a bomb": (
-        archive({"sigma": npy(header("<f4", "(2500000,)"), bytes(10_000_000))}, zipfile.ZIP_DEFLATED),
-        "shard is compressed",
-    ),
-}
-
-
-@pytest.mark.parametrize("claim", CLAIMS)
-def test_claims_of_an_archive(claim: str, tmp_path: Path) -> None:
-    content, says = CLAIMS[claim]
-    path = tmp_path / "s.npz"
-    path.write_bytes(content)
-    for mapped in (True, False):
-        with pytest.raises(InputError) as caught:
-            read_shard(path, mapped=mapped)
-        assert says in caught.value.what
 
 
 def test_a_manifest_cannot_name_files_elsewhere(whole: Path) -> None:

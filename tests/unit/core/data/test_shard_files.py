@@ -101,8 +101,6 @@ def test_arrays_that_do_not_belong_together_are_refused() -> None:
     for name, array, message in (
         ("extra", np.zeros(2500, np.float32), "unknown array 'extra'"),
         ("sigma", np.zeros(2499, np.float32), r"'sigma' has the shape \(2499,\)"),
-        ("u", np.zeros((2500, 3), np.float32), r"'u' has the shape \(2500, 3\)"),
-        ("omega_i", np.zeros((2500, 1, 3), np.float32), "'omega_i' has the shape"),
     ):
         with pytest.raises(InputError, match=message):
             check_arrays({**good, name: array}, "x.npz")
@@ -113,10 +111,6 @@ def test_unreadable_files_are_refused(tmp_path: Path, suffix: str, capfd: pytest
     path = tmp_path / f"x.{suffix}"
     with pytest.raises(InputError, match="no such shard"):
         read_shard(path)
-    for content in (b"", b"hello", bytes(1000)):
-        path.write_bytes(content)
-        with pytest.raises(InputError, match="cannot be read"):
-            read_shard(path)
     write_shard(path, arrays(SHUFFLED))
     whole = path.read_bytes()
     for share in (0.001, 0.1, 0.5, 0.99):
@@ -126,6 +120,14 @@ def test_unreadable_files_are_refused(tmp_path: Path, suffix: str, capfd: pytest
     assert capfd.readouterr() == ("", "")
 
 
+def test_an_npz_array_that_claims_more_than_it_holds_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "x.npz"
+    write_shard(path, arrays(SHUFFLED))
+    path.write_bytes(path.read_bytes().replace(b"(2500,", b"(9500,"))
+    with pytest.raises(InputError, match="not as long as its header says"):
+        read_shard(path)
+
+
 def test_an_exr_image_that_is_no_shard(tmp_path: Path) -> None:
     import OpenEXR
 
@@ -133,12 +135,4 @@ def test_an_exr_image_that_is_no_shard(tmp_path: Path) -> None:
     header = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}
     OpenEXR.File(header, {"Y": np.zeros((4, 4), np.float32)}).write(str(path))
     with pytest.raises(InputError, match="not a shard"):
-        read_shard(path)
-    OpenEXR.File(
-        {**header, "mbtf.lead": "99"}, {c: np.zeros((4, 4), np.float32) for a in ARRAYS for c in a.channels}
-    ).write(str(path))
-    with pytest.raises(InputError, match="cannot be read"):
-        read_shard(path)
-    OpenEXR.File({**header, "mbtf.lead": "16"}, {"sigma": np.zeros((4, 4), np.float32)}).write(str(path))
-    with pytest.raises(InputError, match="lacks the array 'u'"):
         read_shard(path)

@@ -82,12 +82,6 @@ def test_the_data_are_synced_before_the_rename(tmp_path: Path, monkeypatch: pyte
         assert events == expected
 
 
-def test_json_refuses_what_is_no_number(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="not JSON compliant"):
-        atomic.write_json(tmp_path / "a.json", {"loss": float("nan")})
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_of_several_creators_one_wins_and_its_content_stays(tmp_path: Path) -> None:
     path = tmp_path / "a"
     gate, won = threading.Barrier(8), []
@@ -160,14 +154,6 @@ def test_the_checksum_is_that_of_the_file_with_its_digits_at_zero(tmp_path: Path
     stored = json.loads(content)["checksum"]
     assert stored == hashlib.sha256(content.replace(stored.encode(), b"0" * 64)).hexdigest()
     assert list(json.loads(content)) == ["rows", "checksum"]
-
-
-def test_what_a_library_wrote_is_digested_not_what_it_replaces(tmp_path: Path) -> None:
-    for content in (b"old", b"newer"):
-        stored = atomic.write_through(tmp_path / "a", lambda temporary, c=content: temporary.write_bytes(c))
-        assert stored == atomic.Stored(len(content), hashlib.sha256(content).hexdigest())
-        assert (tmp_path / "a").read_bytes() == content
-    assert no_leftovers(tmp_path)
 
 
 @pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC])

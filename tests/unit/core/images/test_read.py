@@ -1,11 +1,15 @@
-"""Images decode to exact numbers, and unusable ones are refused in one line."""
+"""Images decode to exact numbers, of every kind; unusable ones are refused in one line."""
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import tifffile
+from numpy.typing import NDArray
 from support.image_files import exr, png, rng
 
 from mbtf_core.color import linear_to_srgb, srgb_to_linear
@@ -78,30 +82,19 @@ def test_npy(tmp_path: Path) -> None:
         image = read_image(tmp_path / "i.npy")
         assert image.bits == bits
         assert np.array_equal(np.rint(image.pixels.astype(np.float64) * (2**bits - 1)), codes)
-    np.save(tmp_path / "w.npy", np.zeros((5, 6), np.int64))
-    with pytest.raises(InputError, match="int64 numbers"):
-        read_image(tmp_path / "w.npy")
-    np.save(tmp_path / "s.npy", np.zeros((5, 6, 7)))
-    with pytest.raises(InputError, match=r"shape \(5, 6, 7\)"):
-        read_image(tmp_path / "s.npy")
-    np.save(tmp_path / "o.npy", np.array([[None]]), allow_pickle=True)
-    with pytest.raises(InputError, match="npy"):
-        read_image(tmp_path / "o.npy")
+    refused = {"int64 numbers": np.zeros((5, 6), np.int64), r"shape \(5, 6, 7\)": np.zeros((5, 6, 7))}
+    for message, array in {**refused, "npy": np.array([[None]])}.items():
+        np.save(tmp_path / "w.npy", array, allow_pickle=True)
+        with pytest.raises(InputError, match=message):
+            read_image(tmp_path / "w.npy")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_pixels_that_are_not_finite_are_counted_and_placed(tmp_path: Path, value: float) -> None:
     numbers = np.zeros((4, 6), np.float32)
     numbers[2, 5] = numbers[3, 0] = value
-    with pytest.raises(
-        InputError, match=r"x\.exr: 2 pixels, the first at column 5, row 2, are NaN or infinite"
-    ):
+    with pytest.raises(InputError, match=r"x\.exr: 2 pixels, the first at column 5, row 2, are NaN or inf"):
         read_image(exr(tmp_path / "x.exr", {"Y": numbers}))
-    color = np.zeros((4, 6, 3))
-    color[1, 2] = value
-    np.save(tmp_path / "x.npy", color)
-    with pytest.raises(InputError, match=r"x\.npy: 1 pixel, at column 2, row 1, is NaN or infinite"):
-        read_image(tmp_path / "x.npy")
 
 
 def good_files(folder: Path) -> list[Path]:
@@ -133,46 +126,19 @@ def test_truncated_files_are_refused(tmp_path: Path, share: float, capfd: pytest
     assert capfd.readouterr() == ("", "")
 
 
-def test_kinds_that_would_lose_something_are_refused(tmp_path: Path) -> None:
-    from PIL import Image as Pillow
-
-    Pillow.new("CMYK", (4, 4)).save(tmp_path / "cmyk.jpg")
-    with pytest.raises(InputError, match="CMYK"):
-        read_image(tmp_path / "cmyk.jpg")
-    window = (np.array([1, 0], np.int32), np.array([6, 4], np.int32))
-    cropped = exr(tmp_path / "crop.exr", {"Y": np.zeros((5, 6), np.float32)}, dataWindow=window)
-    with pytest.raises(InputError, match="cropped tile"):
-        read_image(cropped)
-    whole = exr(tmp_path / "int.exr", {"Y": np.zeros((5, 6), np.uint32)})
-    with pytest.raises(InputError, match="stores integers"):
-        read_image(whole)
-
-
-class TestGray:
-    def test_exact_for_equal_channels(self) -> None:
-        codes = rng().integers(0, 256, (4, 5, 1))
-        image = Image(np.repeat(codes, 3, axis=2).astype(np.uint8), Path("x.png"))
-        numbers, warnings = gray(image)
-        assert np.array_equal(numbers, codes[..., 0] / 255)
-        assert warnings == []
-        # Rounding of JPG is no color.
-        rounded = np.full((4, 5, 3), 100, np.uint8)
-        rounded[0, 0, 1] = 102
-        assert gray(Image(rounded, Path("x.jpg")))[1] == []
-
-    def test_color_becomes_luminance_with_a_warning(self) -> None:
-        codes = np.zeros((4, 5, 3), np.uint8)
-        codes[..., 1] = 51
-        numbers, warnings = gray(Image(codes, Path("x.png")))
-        assert numbers == pytest.approx(0.7152 * 0.2)
-        assert len(warnings) == 1
-        assert "luminance" in warnings[0]
-
-    def test_alpha_that_means_something_is_mentioned(self) -> None:
-        codes = np.full((4, 5, 2), 255, np.uint8)
-        assert gray(Image(codes, Path("x.png")))[1] == []
-        codes[0, 0, 1] = 128
-        assert "alpha" in gray(Image(codes, Path("x.png")))[1][0]
+def test_gray_is_exact_for_equal_channels_and_else_the_luminance_with_a_warning() -> None:
+    codes = rng().integers(0, 256, (4, 5, 1))
+    numbers, warnings = gray(Image(np.repeat(codes, 3, axis=2).astype(np.uint8), Path("x.png")))
+    assert np.array_equal(numbers, codes[..., 0] / 255)
+    assert warnings == []
+    # Rounding of JPG is no color.
+    rounded = np.full((4, 5, 3), 100, np.uint8)
+    rounded[0, 0, 1] = 102
+    assert gray(Image(rounded, Path("x.jpg")))[1] == []
+    numbers, (warning,) = gray(Image(np.uint8([[[0, 51, 0]]]), Path("x.png")))
+    assert numbers == pytest.approx(0.7152 * 0.2)
+    assert "luminance" in warning
+    assert "alpha" in gray(Image(np.uint8([[[255, 128]]]), Path("x.png")))[1][0]
 
 
 def test_srgb() -> None:
@@ -185,10 +151,113 @@ def test_srgb() -> None:
     assert np.all(np.diff(srgb_to_linear(x)) > 0)
 
 
-@pytest.mark.parametrize("bits", [8, 16])
-def test_channels_of_many_rows_become_linear(bits: int) -> None:
-    codes = rng().integers(0, 2**bits, (1000, 3, 3)).astype(f"u{bits // 8}")
-    image = Image(codes, Path("x.png"))
-    shares = codes[..., [2, 0]] / (2**bits - 1)
-    assert np.allclose(image.linear((2, 0)), shares, atol=1e-7)
-    assert np.allclose(image.linear((2, 0), encoded=True), srgb_to_linear(shares), atol=1e-6)
+class TestTiff:
+    @pytest.mark.parametrize("compression", [None, "lzw", "packbits", "zstd"])
+    @pytest.mark.parametrize(("channels", "dtype"), [(1, "u1"), (3, "u2"), (4, "f4"), (3, "f2")])
+    def test_every_number_is_kept(
+        self, tmp_path: Path, compression: str | None, channels: int, dtype: str
+    ) -> None:
+        noise = rng().random((20, 37, channels))
+        stored = (noise * 65535).astype(dtype) if dtype[0] == "u" else (100 * noise - 50).astype(dtype)
+        extra: dict[str, Any] = {"extrasamples": ["unassalpha"]} if channels == 4 else {}
+        extra["photometric"] = "minisblack" if channels == 1 else "rgb"
+        pixels = stored if channels > 1 else stored[..., 0]
+        tifffile.imwrite(tmp_path / "x.tif", pixels, compression=compression, **extra)
+        image = read_image(tmp_path / "x.tif")
+        assert image.bits == {"u1": 8, "u2": 16}.get(dtype)
+        scale = 2**image.bits - 1 if image.bits else 1
+        assert np.array_equal(np.rint(image.pixels * scale) if image.bits else image.pixels, stored)
+
+    def test_tiles_and_planes(self, tmp_path: Path) -> None:
+        codes = rng().integers(0, 65536, (70, 50, 3)).astype(np.uint16)
+        tifffile.imwrite(tmp_path / "tiled.tif", codes, tile=(32, 16), compression="lzw", photometric="rgb")
+        planes = np.moveaxis(codes, -1, 0)
+        tifffile.imwrite(tmp_path / "planes.tif", planes, photometric="rgb", planarconfig="separate")
+        for name in ("tiled.tif", "planes.tif"):
+            assert np.array_equal(np.rint(read_image(tmp_path / name).pixels.astype(float) * 65535), codes)
+
+    @pytest.mark.parametrize("dtype", ["u1", "u2"])
+    def test_white_may_be_zero(self, tmp_path: Path, dtype: str) -> None:
+        stored = rng().integers(0, np.iinfo(dtype).max, (6, 8)).astype(dtype)
+        tifffile.imwrite(tmp_path / "x.tif", stored, photometric="miniswhite")
+        largest = np.iinfo(dtype).max
+        assert np.array_equal(read_image(tmp_path / "x.tif").pixels[..., 0], (largest - stored) / largest)
+
+
+def test_several_parts(tmp_path: Path) -> None:
+    import OpenEXR
+
+    rough, disp = (rng().random((4, 6)).astype(np.float32) for _ in range(2))
+    head = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    layers = (("rough", rough), ("disp", disp + 1))
+    parts = [OpenEXR.Part({**head, "name": name}, {"Y": y}, name) for name, y in layers]
+    OpenEXR.File(parts).write(str(tmp_path / "x.exr"))
+    image = read_image(tmp_path / "x.exr", "disp")
+    assert np.array_equal(image.pixels[..., 0], disp + 1)
+    assert image.channels == ("disp.Y",)
+    assert np.array_equal(read_image(tmp_path / "x.exr", "rough.Y").pixels[..., 0], rough)
+
+
+def test_single_channels_of_other_kinds(tmp_path: Path) -> None:
+    codes = rng().integers(0, 65536, (5, 6, 4))
+    path = png(tmp_path / "packed.png", codes, 6, 16)
+    for index, name in enumerate("RGBA"):
+        image = read_image(path, name.lower())
+        assert np.array_equal(image.pixels, codes[..., index : index + 1] / 65535)
+        assert image.channels == (name,)
+    with pytest.raises(InputError, match="no channel 'Y'"):
+        read_image(path, "Y")
+
+
+Codes = NDArray[np.uint8]
+
+
+def write(path: Path, codes: Codes, origin: int, *, runs: bool, palette: Codes | None = None) -> Path:
+    """Codes (H, W, C), gray, gray and alpha, RGB or RGBA, or indices of a palette (n, 3)."""
+    rows, columns, channels = codes.shape
+    kind = 1 if palette is not None else 3 if channels < 3 else 2
+    order = [2, 1, 0, 3][:channels] if channels > 2 else list(range(channels))
+    stored = codes[..., order]
+    stored = stored if origin & 0x20 else stored[::-1]
+    stored = stored[:, ::-1] if origin & 0x10 else stored
+    head = struct.pack(
+        "<BBBHHBHHHHBB",
+        3,  # length of the text behind the header
+        int(palette is not None),
+        kind + 8 * runs,
+        0,
+        0 if palette is None else len(palette),
+        0 if palette is None else 24,
+        *(0, 0, columns, rows),
+        8 * channels,
+        origin | (8 if channels in (2, 4) else 0),
+    )
+    table = b"" if palette is None else palette[:, ::-1].tobytes()
+    pixels = [bytes(pixel) for line in stored for pixel in line]
+    body = b"".join(_runs(pixels)) if runs else b"".join(pixels)
+    path.write_bytes(head + b"abc" + table + body)
+    return path
+
+
+def _runs(pixels: list[bytes]) -> list[bytes]:
+    """Packets of two pixels: a run where they are equal, else as they are."""
+    pairs = zip(pixels[::2], pixels[1::2], strict=True)
+    return [b"\x81" + a if a == b else b"\x01" + a + b for a, b in pairs]
+
+
+@pytest.mark.parametrize("runs", [False, True])
+@pytest.mark.parametrize("origin", [0x00, 0x10, 0x20, 0x30])
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_every_code_is_in_its_place(tmp_path: Path, channels: int, origin: int, runs: bool) -> None:
+    codes = rng().integers(0, 256, (5, 6, channels)).astype(np.uint8)
+    codes[2] = codes[2, :1]  # runs
+    image = read_image(write(tmp_path / "x.tga", codes, origin, runs=runs))
+    assert image.bits == 8
+    assert np.array_equal(np.rint(255 * image.pixels), codes)
+
+
+def test_a_palette(tmp_path: Path) -> None:
+    palette = rng().integers(0, 256, (4, 3)).astype(np.uint8)
+    codes = rng().integers(0, 4, (5, 6, 1)).astype(np.uint8)
+    image = read_image(write(tmp_path / "x.TGA", codes, 0, runs=True, palette=palette))
+    assert np.array_equal(np.rint(255 * image.pixels), palette[codes[..., 0]])

@@ -7,10 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
-from support.gltf_files import SQUARE, SQUARE_UV, GltfBuilder
+from support.gltf_files import SQUARE_UV, GltfBuilder
 
-from mbtf_core.errors import InputError
 from mbtf_core.meshes.content import MeshContent, MeshShape, Texture, numbers_of
 from mbtf_core.meshes.read import read_mesh_content
 
@@ -43,9 +41,7 @@ def shape_of(builder: GltfBuilder, folder: Path) -> MeshShape:
 
 
 def texture_of(shape: MeshShape, role: str = "base_color") -> Texture:
-    value = shape.values[role]
-    assert isinstance(value, tuple)
-    return value[0]
+    return shape.values[role][0]
 
 
 def extension(name: str, **values: Any) -> dict[str, Any]:
@@ -65,21 +61,21 @@ SHEEN = {"sheenColorFactor": [1, 0.5, 0], "sheenColorTexture": SHEEN_COLOR}
 SHEEN |= {"sheenRoughnessFactor": 0.5, "sheenRoughnessTexture": FOUR}
 ALPHA = {alpha: codes((255, 255, 255, alpha), (255, 255, 255, 255)) for alpha in (0, 51, 204, 255)}
 HALF = {"baseColorFactor": [1, 1, 1, 0.5]}
+BLEND, MASK = {"alphaMode": "BLEND"}, {"alphaMode": "MASK"}
 # Material (its metallic and roughness, and the rest), and values by role; None: there are none.
 VALUES: dict[str, tuple[dict[str, Any] | None, dict[str, Any], dict[str, Any]]] = {
     # An index of refraction of 1.5 reflects 4%, half of what `specular` 1 does.
     "nothing": (None, {}, {"base_color": [1, 1, 1], "roughness": 1, "metallic": 1, "specular": 0.5}),
     "factors": (
-        {"baseColorFactor": [0.0018, 0.0055, 0.0137, 1], "metallicFactor": 0, "roughnessFactor": 0.9},
+        {"baseColorFactor": [0.1, 0.2, 0.3, 1], "metallicFactor": 0, "roughnessFactor": 0.9},
         {},
-        {"base_color": [0.0018, 0.0055, 0.0137], "roughness": 0.9, "metallic": 0},
+        {"base_color": [0.1, 0.2, 0.3], "roughness": 0.9, "metallic": 0},
     ),
     "colors are sRGB": (
         {"baseColorTexture": codes((0, 10, 128), (200, 255, 255)), "baseColorFactor": [1, 1, 0.5, 1]},
         {},
         {"base_color": [[[0, CODES[10], CODES[128] / 2], [CODES[200], 1, 0.5]]]},
     ),
-    "gray": ({"baseColorTexture": codes(128)}, {}, {"base_color": [[[CODES[128]] * 3]]}),
     "numbers are linear": (
         {"metallicRoughnessTexture": codes((65535, 13107, 26214), dtype=np.uint16), "roughnessFactor": 0.5},
         {},
@@ -91,44 +87,13 @@ VALUES: dict[str, tuple[dict[str, Any] | None, dict[str, Any], dict[str, Any]]] 
         extension("sheen", **SHEEN),
         {"sheen": 1, "sheen_color": [[[CODES[128], CODES[128] / 2, 0]]], "sheen_roughness": [[0.4]]},
     ),
-    "layers of no weight": (
-        {},
-        extension("clearcoat") | extension("sheen"),
-        {"clearcoat": None, "sheen": None},
-    ),
     "bare coat": ({}, extension("clearcoat", clearcoatFactor=1), {"clearcoat": 1, "clearcoat_roughness": 0}),
-    "specular weight": (
-        {"metallicFactor": 0},
-        extension("specular", specularTexture=FOUR),
-        {"specular": [[0.5 * 0.8]]},
-    ),
-    "specular color": (
-        {"metallicFactor": 0},
-        extension("specular", specularColorTexture=codes((128, 128, 128))),
-        {"specular": [[0.5 * CODES[128]]]},
-    ),
+    "specular weight": ({}, extension("specular", specularTexture=FOUR), {"specular": [[0.4]]}),
     "opaque": ({"baseColorTexture": ALPHA[0], **HALF}, {}, {"opacity": None}),
-    "blended": (
-        {"baseColorTexture": ALPHA[51], **HALF},
-        {"alphaMode": "BLEND"},
-        {"opacity": [[0.1, 0.5]], "opacity_cutoff": None},
-    ),
-    "blended, without holes": ({"baseColorTexture": ALPHA[255]}, {"alphaMode": "BLEND"}, {"opacity": None}),
-    "blended, without alpha": (
-        {"baseColorTexture": codes((51, 51, 51)), **HALF},
-        {"alphaMode": "BLEND"},
-        {"opacity": [[0.5]]},
-    ),
-    "masked": (
-        {"baseColorTexture": ALPHA[0]},
-        {"alphaMode": "MASK"},
-        {"opacity": [[0, 1]], "opacity_cutoff": 0.5},
-    ),
-    "masked, all above the cutoff": (
-        {"baseColorTexture": ALPHA[204]},
-        {"alphaMode": "MASK"},
-        {"opacity": None, "opacity_cutoff": None},
-    ),
+    "blended": ({"baseColorTexture": ALPHA[51], **HALF}, BLEND, {"opacity": [[0.1, 0.5]]}),
+    "blended, without holes": ({"baseColorTexture": ALPHA[255]}, BLEND, {"opacity": None}),
+    "masked": ({"baseColorTexture": ALPHA[0]}, MASK, {"opacity": [[0, 1]], "opacity_cutoff": 0.5}),
+    "masked, all above the cutoff": ({"baseColorTexture": ALPHA[204]}, MASK, {"opacity": None}),
 }
 
 
@@ -145,21 +110,7 @@ def test_values_of_materials(tmp_path: Path, name: str) -> None:
             assert numbers_of(values[role]) == pytest.approx(np.array(wanted), abs=1e-6), role
 
 
-def test_jpeg_files_beside_it_are_read_whatever_their_name(tmp_path: Path) -> None:
-    pixels = np.full((8, 8, 3), (200, 10, 128), np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "wood a.png", "JPEG", quality=100, subsampling=0)
-    builder = GltfBuilder()
-    builder.add("images", {"uri": "wood%20a.png"})
-    base = {"baseColorTexture": {"index": builder.add("textures", {"source": 0})}}
-    found = content_of(plate_of(base, builder), tmp_path)
-    assert found.files == {"wood%20a.png": tmp_path / "wood a.png"}
-    expected = [CODES[200], CODES[10], CODES[128]]
-    assert numbers_of(found.shapes[0].values["base_color"])[0, 0] == pytest.approx(expected, abs=0.01)
-
-
-@pytest.mark.parametrize(
-    ("codes", "wrap"), [(10497, "repeat"), (33648, "mirror"), (33071, "clamp"), (None, "repeat")]
-)
+@pytest.mark.parametrize(("codes", "wrap"), [(33648, "mirror"), (33071, "clamp"), (None, "repeat")])
 def test_samplers(tmp_path: Path, codes: int | None, wrap: str) -> None:
     builder = GltfBuilder()
     sampler = {} if codes is None else {"wrapT": codes, "magFilter": 9728}
@@ -178,15 +129,11 @@ def place(found: Texture, u: float, v: float) -> list[float]:
 @pytest.mark.parametrize(
     ("transform", "at", "expected"),
     [
-        ({"scale": [4, 4], "offset": [0.125, 0]}, (0.25, 0.5), [1.125, 2.0]),
         ({"offset": [0, 1], "scale": [1, -1]}, (0.2, 0.3), [0.2, 0.7]),
         # The example of the extension: the lower left quarter of the image, turned clockwise.
-        ({"offset": [0, 1], "rotation": np.pi / 2, "scale": [0.5, 0.5]}, (0, 0), [0, 1]),
         ({"offset": [0, 1], "rotation": np.pi / 2, "scale": [0.5, 0.5]}, (1, 0), [0, 0.5]),
-        ({"offset": [0, 1], "rotation": np.pi / 2, "scale": [0.5, 0.5]}, (0, 1), [0.5, 1]),
         # Scaled before it is turned.
         ({"rotation": np.pi / 2, "scale": [2, 3]}, (1, 0), [0, -2]),
-        ({"rotation": np.pi / 2, "scale": [2, 3]}, (0, 1), [3, 0]),
     ],
 )
 def test_texture_transforms(
@@ -199,25 +146,18 @@ def test_texture_transforms(
     assert place(texture_of(shape), *at) == expected
 
 
-@pytest.mark.parametrize("by", ["texCoord", "transform"])
-def test_a_second_set_of_texture_coordinates(tmp_path: Path, by: str) -> None:
+def test_a_second_set_of_texture_coordinates(tmp_path: Path) -> None:
     builder = GltfBuilder()
     texture: dict[str, Any] = {"index": builder.texture(np.zeros((2, 2, 3), np.uint8)), "texCoord": 1}
-    if by == "transform":
-        texture |= {"texCoord": 0, "extensions": {"KHR_texture_transform": {"texCoord": 1}}}
     builder.plate(builder.material({"baseColorTexture": texture}), TEXCOORD_1=SQUARE_UV[[2, 3, 0, 1]])
     shape = shape_of(builder, tmp_path)
-    assert shape.uv is not None
     assert shape.uv.tolist() == [[1, 1], [0, 1], [0, 0], [1, 0]]
 
 
 def two_sets(second: np.ndarray) -> GltfBuilder:
     builder = GltfBuilder()
     color, rough = (builder.texture(np.zeros((2, 2, 3), np.uint8)) for _ in range(2))
-    base = {
-        "baseColorTexture": {"index": color},
-        "metallicRoughnessTexture": {"index": rough, "texCoord": 1},
-    }
+    base = {"baseColorTexture": {"index": color}, "metallicRoughnessTexture": {"index": rough, "texCoord": 1}}
     return builder.plate(builder.material(base, name="wood"), TEXCOORD_1=second.astype(np.float32))
 
 
@@ -235,28 +175,14 @@ def test_independent_sets_are_a_fault_of_the_roles_that_need_them(tmp_path: Path
     assert "base_color" in shape.values
 
 
-def test_a_part_without_texture_coordinates_is_a_fault(tmp_path: Path) -> None:
-    builder = GltfBuilder()
-    base = {"baseColorTexture": {"index": builder.texture(np.zeros((2, 2, 3), np.uint8))}}
-    material = builder.material(base)
-    builder.plate(material)
-    builder.node(builder.mesh(SQUARE, material=material))
-    first, second = content_of(builder, tmp_path).shapes
-    assert first.faults == {}
-    assert second.faults.keys() == {"base_color"}
-
-
 @pytest.mark.parametrize(
     ("ior", "specular", "expected", "warned"),
     [
         # F0 = ((n - 1)/(n + 1))² c w is 0.08 times our `specular`.
         (1.33, {}, (0.33 / 2.33) ** 2 / 0.08, False),
-        (2.42, {}, (1.42 / 3.42) ** 2 / 0.08, False),
         (0, {}, 12.5, False),
-        (1.5, {"specularColorFactor": [2, 2, 2]}, 1.0, False),
         (1.5, {"specularColorFactor": [1, 0, 0]}, 0.2126 * 0.5, True),
         (1.5, {"specularFactor": 0.25}, 0.125, True),
-        (1.0, {}, 0.0, True),
         # The product of color and F0 is 1 at most, before the weight.
         (0, {"specularColorFactor": [2, 2, 2], "specularFactor": 0.5}, 6.25, True),
     ],
@@ -275,23 +201,8 @@ def test_vertex_colors_are_clamped_and_linear(tmp_path: Path) -> None:
     codes = np.array([[0, 128, 255, 255]] * 4, np.uint8)
     builder.plate(COLOR_0=builder.accessor(codes, True))
     shape = shape_of(builder, tmp_path)
-    assert shape.colors is not None
     assert shape.colors[0] == pytest.approx([0, 128 / 255, 1])
     builder = GltfBuilder().plate(COLOR_0=np.array([[2, -1, 0.5]] * 4, np.float32))
     found = content_of(builder, tmp_path)
-    assert found.shapes[0].colors is not None
     assert found.shapes[0].colors[0].tolist() == [1, 0, 0.5]
     assert any("clamped" in text for text in found.warnings)
-    with pytest.raises(InputError, match="normalized"):
-        content_of(GltfBuilder().plate(COLOR_0=codes), tmp_path)
-
-
-def test_alpha_of_vertices_is_refused_where_it_counts(tmp_path: Path) -> None:
-    for mode in ("OPAQUE", "BLEND"):
-        builder = GltfBuilder()
-        builder.plate(builder.material(alphaMode=mode), COLOR_0=np.full((4, 4), 0.5, np.float32))
-        if mode == "OPAQUE":
-            assert "opacity" not in shape_of(builder, tmp_path).values
-        else:
-            with pytest.raises(InputError, match="alpha"):
-                content_of(builder, tmp_path)

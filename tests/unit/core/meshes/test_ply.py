@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from PIL import Image
 
 from mbtf_core.errors import InputError
@@ -18,15 +15,7 @@ from mbtf_core.meshes.content import MeshContent
 from mbtf_core.meshes.ply import read_ply
 
 FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-TYPES = {
-    "char": "i1",
-    "uchar": "u1",
-    "short": "i2",
-    "ushort": "u2",
-    "int": "i4",
-    "float": "f4",
-    "double": "f8",
-}
+TYPES = {"char": "i1", "uchar": "u1", "ushort": "u2", "int": "i4", "float": "f4", "double": "f8"}
 SQUARE = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
 XYZ = ["float x", "float y", "float z"]
 CORNERS = "list uchar int vertex_indices"
@@ -70,12 +59,8 @@ def test_polygons_with_colors_and_texture_coordinates_of_vertices(tmp_path: Path
     data = ply({"vertex": (properties, vertices), "face": (["char flags", CORNERS], faces)}, kind)
     content = read(tmp_path, data)
     (shape,) = content.shapes
-    assert shape.uv is not None
-    assert shape.colors is not None
-    assert (
-        shape.vertices[shape.faces].tolist()
-        == np.array([*SQUARE, (2, 0, 0)])[[[0, 1, 2], [0, 2, 3], [1, 4, 2]]].tolist()
-    )
+    corners = np.array([*SQUARE, (2, 0, 0)])[[[0, 1, 2], [0, 2, 3], [1, 4, 2]]]
+    assert shape.vertices[shape.faces].tolist() == corners.tolist()
     np.testing.assert_array_equal(shape.uv, shape.vertices[:, :2])
     np.testing.assert_allclose(shape.colors, np.tile([1, 0.5029, 0], (5, 1)), atol=1e-4)
     assert shape.values["base_color"].tolist() == [1, 1, 1]
@@ -93,7 +78,6 @@ def test_texture_coordinates_and_colors_of_faces(tmp_path: Path, kind: str) -> N
     content = read(tmp_path, ply(elements, kind, ("made by hand", "TextureFile my atlas.png")))
     bare, textured = content.shapes
     assert bare.uv is None
-    assert textured.uv is not None
     np.testing.assert_array_equal(textured.uv[textured.faces], [[[0, 0], [1, 0], [1, 1]]])
     texture, factor = textured.values["base_color"]
     assert texture.pixels == pytest.approx(0.5029, abs=1e-4)
@@ -106,49 +90,6 @@ def test_texture_coordinates_and_colors_of_faces(tmp_path: Path, kind: str) -> N
     np.testing.assert_allclose(colors[True], np.tile([0.5, 0.5, 0], (3, 1)))
 
 
-@pytest.mark.parametrize("names", ["u v", "texture_u texture_v"])
-def test_images_of_several_numbers(tmp_path: Path, names: str) -> None:
-    for name, code in (("a.png", 0), ("b.png", 255)):
-        Image.fromarray(np.full((1, 1), code, np.uint8)).save(tmp_path / name)
-    vertices = [(*p, *p[:2]) for p in SQUARE]
-    faces = [(*triangle, number) for number, triangle in zip((1, 0), TRIANGLES, strict=True)]
-    elements = {
-        "vertex": ([*XYZ, *(f"float {name}" for name in names.split())], vertices),
-        "face": ([CORNERS, "int texnumber"], faces),
-    }
-    first, second = read(tmp_path, ply(elements, comments=("TextureFile a.png", "TextureFile b.png"))).shapes
-    assert [s.values["base_color"][0].pixels.max() for s in (first, second)] == [0, 1]
-    assert second.vertices[second.faces][0].tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0]]
-    first, second = read(tmp_path, ply(elements, comments=("TextureFile a.png",))).shapes
-    assert second.faults.keys() == {"base_color"}
-
-
-def test_colors_of_sixteen_bits_and_beside_images(tmp_path: Path) -> None:
-    properties = [*XYZ, *(f"ushort {c}" for c in ("red", "green", "blue")), "float s", "float t"]
-    # 0.5 as sRGB is 0.2140 (IEC 61966-2-1).
-    vertices = [(*p, 65535, 32768, 0, *p[:2]) for p in SQUARE]
-    elements = {"vertex": (properties, vertices), "face": ([CORNERS], TRIANGLES)}
-    (shape,) = read(tmp_path, ply(elements)).shapes
-    assert shape.colors is not None
-    assert shape.colors[0] == pytest.approx([1, 0.2140, 0], abs=1e-4)
-    Image.fromarray(np.full((2, 2, 3), 255, np.uint8)).save(tmp_path / "a.png")
-    content = read(tmp_path, ply(elements, comments=("TextureFile a.png",)))
-    assert content.shapes[0].colors is None
-    assert isinstance(content.shapes[0].values["base_color"], tuple)
-    assert any("colors of its vertices are not used" in text for text in content.warnings)
-
-
-def test_a_missing_image_and_colors_out_of_range_are_faults(tmp_path: Path) -> None:
-    elements = {"vertex": (XYZ, SQUARE), "face": ([CORNERS], TRIANGLES)}
-    (shape,) = read(tmp_path, ply(elements, comments=("TextureFile gone away.png",))).shapes
-    assert "gone away.png" in shape.faults["base_color"].message
-    colored = [*XYZ, "float red", "float green", "float blue"]
-    elements["vertex"] = (colored, [(*p, 255, 0, 0) for p in SQUARE])
-    assert "base_color" in read(tmp_path, ply(elements)).shapes[0].faults
-    elements["vertex"] = (colored, [(*p, "nan", 0, 0) for p in SQUARE])
-    assert "base_color" in read(tmp_path, ply(elements)).shapes[0].faults
-
-
 WHOLE = ply({"vertex": (XYZ, SQUARE), "face": ([CORNERS], TRIANGLES)}, "binary_little_endian")
 TEXT = ply({"vertex": (XYZ, SQUARE), "face": ([CORNERS], TRIANGLES)})
 
@@ -157,28 +98,13 @@ TEXT = ply({"vertex": (XYZ, SQUARE), "face": ([CORNERS], TRIANGLES)})
     ("data", "says"),
     [
         (WHOLE[:-1], "complete"),
-        (WHOLE[:-14], "complete"),
         (WHOLE.replace(b"vertex 4", b"vertex 300000000"), "300,000,000"),
-        (WHOLE.replace(b"face 2", b"face 300000000"), "300,000,000"),
         (TEXT.replace(b"vertex 4", b"vertex 300000000"), "300,000,000"),
         (TEXT.replace(b"3 0 2 3", b"3000000000 0 2 3"), "list|complete"),
-        (TEXT.replace(b"3 0 2 3", b"-1 0 2 3"), "list"),
-        (TEXT.replace(b"3 0 2 3", b"3 0 2 9"), "lacks"),
         (TEXT.replace(b"3 0 2 3", b"3 0 2 -1"), "lacks"),
-        (TEXT.replace(b"3 0 2 3", b"3 0 2 x"), "no numbers"),
-        (TEXT.replace(b"list uchar", b"list float"), "header"),
-        (TEXT.replace(b"float x", b"float y"), "twice"),
         (TEXT.replace(b"float x", b"float a"), "x, y and z"),
-        (TEXT.replace(b"float x", b"list uchar float x"), "x, y and z"),
         (TEXT.replace(b"end_header", b"end"), "header"),
-        (b"", "empty"),
-        (b"obj", "header"),
         (ply({"vertex": (XYZ, SQUARE)}), "cloud of points"),
-        (ply({"vertex": (XYZ, SQUARE), "face": ([CORNERS], [])}), "cloud of points"),
-        (
-            ply({"vertex": (XYZ, SQUARE), "tristrips": ([CORNERS], [([0, 1, 2, -1],)])}),
-            "strips",
-        ),
     ],
 )
 def test_damaged_and_other_files_are_refused(tmp_path: Path, data: bytes, says: str) -> None:
@@ -201,16 +127,3 @@ def test_trimesh_and_mitsuba_read_the_same(tmp_path: Path, encoding: str) -> Non
     np.testing.assert_array_equal(
         positions[np.array(params["faces"]).reshape(-1, 3)], shape.vertices[shape.faces].astype(np.float32)
     )
-
-
-@settings(max_examples=150, deadline=None)
-@given(data=st.data(), whole=st.sampled_from([WHOLE, TEXT]))
-def test_altered_files_are_read_or_refused(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject, whole: bytes
-) -> None:
-    start = data.draw(st.integers(0, len(whole) - 1))
-    length = data.draw(st.integers(0, 8))
-    altered = whole[:start] + data.draw(st.binary(max_size=8)) + whole[start + length :]
-    with contextlib.suppress(InputError):
-        for shape in read(tmp_path_factory.mktemp("fuzz"), altered).shapes:
-            assert shape.faces.max() < len(shape.vertices)

@@ -1,11 +1,11 @@
-"""The camera's queries against what a pinhole sees, from finite differences."""
+"""Directions, and the camera's queries against what a pinhole sees, from finite differences."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from mbtf_core.directions import from_angles
+from mbtf_core.directions import from_angles, from_projected_disk
 from mbtf_core.pictures import Camera
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -42,3 +42,23 @@ def test_views_point_from_the_plane_to_the_camera(aspect: float) -> None:
     np.testing.assert_allclose(omega[30, 40], from_angles(30.0, 40.0), atol=1e-6)
     np.testing.assert_allclose(x[30, 40], CAMERA.target, atol=1e-5)
     assert np.linalg.norm(x[30, 80] - x[30, 0]) * 81 / 80 == pytest.approx(CAMERA.tiles_across, rel=1e-2)
+
+
+def test_axes() -> None:
+    """Azimuth counts from +u towards +v."""
+    assert from_angles(0, 0) == pytest.approx([1, 0, 0], abs=1e-15)
+    assert from_angles(0, 90) == pytest.approx([0, 1, 0], abs=1e-15)
+    assert from_angles([90, 90], [10, 200]) == pytest.approx(np.array([[0, 0, 1], [0, 0, 1]]), abs=1e-15)
+    assert from_angles(np.zeros((2, 1)), np.zeros(3)).shape == (2, 3, 3)
+    assert np.linalg.norm(from_angles(33.0, 123.0)) == pytest.approx(1.0)
+    # Grazing elevations keep their precision.
+    assert from_angles(1e-6, 45.0)[2] == pytest.approx(np.radians(1e-6), rel=1e-9)
+
+
+@pytest.mark.parametrize("radius", [0.0, 0.5, 0.99, 1.0])
+def test_projected_disk(radius: float) -> None:
+    omega = from_projected_disk([radius * 0.6, radius * -0.8])
+    assert omega[:2] == pytest.approx([radius * 0.6, radius * -0.8])
+    assert np.linalg.norm(omega) == pytest.approx(1.0)
+    # Rounding beyond the disk gives no NaN.
+    assert from_projected_disk([1.0 + 1e-12, 0.0])[2] == 0.0

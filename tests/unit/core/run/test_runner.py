@@ -116,14 +116,6 @@ def test_a_crash_ends_its_process_alone() -> None:
     assert not good.error
 
 
-def test_processes_divide_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mbtf_core.run.processes.available_cores", lambda: 8)
-    (two,) = Processes(2).map(run_tasks.threads, [Item("a")])
-    (one,) = Processes().map(run_tasks.threads, [Item("a")])
-    assert two.value[0] == 4
-    assert one.value[0] is None
-
-
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
 def test_a_child_ends_with_a_killed_command(tmp_path: Path, number: signal.Signals) -> None:
     script, mark = tmp_path / "command.py", tmp_path / "mark"
@@ -154,22 +146,3 @@ def test_the_end_of_a_child_is_reported(
 ) -> None:
     outcome = run_child("support.children", function, *arguments, timeout=4 if function == "hang" else 60)
     assert (outcome.answers, outcome.fault) == (answers, fault)
-
-
-def test_an_interrupted_parent_leaves_no_child(monkeypatch: pytest.MonkeyPatch) -> None:
-    started: list[subprocess.Popen[str]] = []
-
-    class Interrupted(subprocess.Popen):  # type: ignore[type-arg]
-        @property
-        def stdin(self):  # type: ignore[no-untyped-def]
-            started.append(self)
-            raise KeyboardInterrupt
-
-        @stdin.setter
-        def stdin(self, pipe):  # type: ignore[no-untyped-def]
-            self.pipe = pipe
-
-    monkeypatch.setattr("mbtf_core.run.processes.subprocess.Popen", Interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        run_child("support.children", "hang", timeout=60)
-    assert started[0].poll() is not None

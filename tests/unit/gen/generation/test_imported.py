@@ -8,25 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from support.measured_data import Images, Listed, known
 from support.paths import ROOT
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.schema import CONVENTIONS
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import load_split, load_training
+from mbtf_fit.data.loader import load_training
 from mbtf_fit.formatting import report_errors
-from mbtf_fit.training.trainer import prepare_trainer
-from mbtf_gen.cli.generate import describe
 from mbtf_gen.config.exchange import ImportConfig
 from mbtf_gen.generation import imported
 from mbtf_gen.generation.imported import Import, import_measured
 from mbtf_gen.generation.repair import repair
-from mbtf_gen.sampling.query_sampler import slice_directions
 from mbtf_pipeline.compare.metrics import dataset_errors
 
 Open = Callable[..., Import]
@@ -82,32 +77,6 @@ def test_test_queries_have_pairs_of_their_own(opened: Open, tmp_path: Path) -> N
     assert len(train | test) > 55
 
 
-def test_options_of_values(opened: Open, tmp_path: Path) -> None:
-    plain = opened(Images(), queries={"train": "300", "test": "1"}, seed=3)
-    import_measured(plain, tmp_path / "plain")
-    kept = opened(Images(), queries={"train": "300", "test": "1"}, seed=3, cosine="excluded", scale=2.0)
-    import_measured(kept, tmp_path / "kept")
-    a, b = (Dataset.open(tmp_path / name).load("train") for name in ("plain", "kept"))
-    assert (a["u"] == b["u"]).all()
-    np.testing.assert_allclose(b["value_a"], 2.0 * a["value_a"] * a["omega_i"][:, 2:], rtol=1e-5)
-    silent = Images()
-    silent.cosine = None
-    with pytest.raises(InputError, match="does not say whether values include the cosine"):
-        import_measured(opened(silent), tmp_path / "silent")
-    with pytest.raises(InputError, match="no pair of light and view"):
-        opened(Images(), queries={"min_cos": 0.9999})
-
-
-def test_negative_values_are_kept_and_counted(opened: Open, tmp_path: Path) -> None:
-    listed = Listed(1000)
-    listed.arrays["value"][::10, 1] = -0.25
-    job = opened(listed, queries={"train": "900", "test": "100"})
-    import_measured(job, tmp_path / "shards")
-    data = Dataset.open(tmp_path / "shards")
-    stored = sum(int((data.load(split)["value_a"] == -0.25).sum()) for split in ("train", "test"))
-    assert job.negative == stored == 100
-
-
 def test_an_interrupted_import_resumes_with_the_same_bytes(opened: Open, tmp_path: Path) -> None:
     queries = {"train": "20/texel", "test": "100"}
     import_measured(opened(Images(), queries=queries), tmp_path / "whole")
@@ -127,24 +96,6 @@ def test_an_interrupted_import_resumes_with_the_same_bytes(opened: Open, tmp_pat
     import_measured(opened(Images(), queries=queries, seed=1), tmp_path / "part", overwrite=True)
     with pytest.raises(InputError, match="cannot be generated again"):
         repair(tmp_path / "part")
-
-
-def test_no_noise_is_claimed(opened: Open, tmp_path: Path) -> None:
-    summary = import_measured(opened(Images(), queries={"train": "300", "test": "9"}), tmp_path / "shards")
-    assert summary.relative_error is None
-    assert "nothing left to do" not in describe(summary)
-    assert "its noise is unknown" in describe(summary)
-    data = Dataset.open(tmp_path / "shards")
-    (shard,) = data.shards("train")
-    assert shard.sidecar["statistics"]["mean_variance"] is None
-    assert data.manifest["summary"]["relative_error"] is None
-    assert data.manifest["measured"]["light_width"] is None
-    assert "only value" in data.manifest["arrays"]["value_a"]["meaning"]
-    assert data.manifest["conventions"].keys() == CONVENTIONS.keys()
-    config = FitConfig.model_validate({"model": "neumip-baseline"})
-    partition = load_training(data, config.held_out, 0)
-    trainer = prepare_trainer(config, data, partition, torch.device("cpu"))
-    assert trainer.regularization.weights == 0
 
 
 @pytest.mark.parametrize("test", [100, 300, 499])
@@ -184,9 +135,7 @@ def test_options_select_from_a_list(opened: Open, tmp_path: Path, monkeypatch: p
     parts = [data.load(split) for split in ("train", "test")]
     assert [len(p["sigma"]) for p in parts] == [123, 45]
     lowest = np.minimum(source.arrays["omega_i"][:, 2], source.arrays["omega_o"][:, 2])
-    assert data.manifest["measured"]["queries"] == 1000
     assert data.manifest["measured"]["left_out"] == (lowest < 0.6).sum()
-    assert data.manifest["measured"]["divided_by_cosine"]
     found = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
     assert len(np.unique(found["u"], axis=0)) == 168
     assert min(found["omega_i"][:, 2].min(), found["omega_o"][:, 2].min()) >= 0.6
@@ -197,17 +146,6 @@ def test_options_select_from_a_list(opened: Open, tmp_path: Path, monkeypatch: p
     at = np.array([order[tuple(u)] for u in found["u"].tolist()])
     counts = np.histogram(at, bins=4, range=(0, 1000))[0]
     assert counts.min() > 25
-    with pytest.raises(InputError, match="has 0 usable queries of 1,000"):
-        opened(Listed(), queries={"min_cos": 0.999})
-
-
-def test_footprints_of_a_list_are_those_of_levels(opened: Open, tmp_path: Path) -> None:
-    source = Listed()
-    source.arrays["sigma"][::10], source.arrays["sigma"][5::10] = 1e-20, 7.0
-    job = opened(source, queries={"test": "100"})
-    assert (job.facts["left_out"], job.lattice.finest) == (200, 4)
-    import_measured(job, tmp_path / "shards")
-    assert (Dataset.open(tmp_path / "shards").load("train")["sigma"] == np.float32(0.5 / 16)).all()
 
 
 def test_errors_of_a_fit_include_the_noise(opened: Open, tmp_path: Path) -> None:
@@ -227,27 +165,6 @@ def test_errors_of_a_fit_include_the_noise(opened: Open, tmp_path: Path) -> None
     assert any("include the noise of the data" in line for line in report_errors(result.errors, None))
     compared = dataset_errors({"a": result.material}, Dataset.open(tmp_path / "shards"))
     assert compared["a"]["splits"]["test"]["includes_noise"]
-    # Error bars are the scatter of squared errors over queries.
-    held = load_split(Dataset.open(tmp_path / "shards"), "test")
-    squares = ((result.material.predict(held) - held.value_a).astype(np.float64) ** 2).mean(axis=1)
-    assert test["mse"]["error"] == pytest.approx(squares.std(ddof=1) / np.sqrt(len(squares)), rel=1e-3)
     streamed = load_training(Dataset.open(tmp_path / "shards"), config.held_out, 0, memory=None).training
     kept = load_training(Dataset.open(tmp_path / "shards"), config.held_out, 0).training
     assert (streamed.slice(5, 50).value == kept.slice(5, 50).value).all()  # type: ignore[union-attr]
-
-
-def test_levels_without_data_are_averages(opened: Open, tmp_path: Path) -> None:
-    queries = {"train": "400/texel", "test": "500", "min_cos": 0.2}
-    import_measured(opened(Images(lights=16), queries=queries), tmp_path / "shards")
-    config = FitConfig.model_validate({"model": "neumip-baseline", "training": {"steps": 400, "batch": 4096}})
-    material = fit(config, tmp_path / "shards", tmp_path / "fit").material
-    coverage = material.description["training"]["coverage"]
-    assert [level for level, share in coverage.items() if share == 0] == ["0", "1", "2"]
-    pyramid = material.model.pyramid.export()
-    np.testing.assert_allclose(pyramid["0"][0, 0], pyramid["3"].mean((0, 1)), atol=1e-5)
-    omega = slice_directions("spiral", 40, 0.3)
-    light, view = omega[:20], omega[20:]
-    found = material.evaluate(np.full((20, 2), 0.5), np.full(20, 0.5), light, view)
-    grid = (np.stack(np.mgrid[:12, :12], -1).reshape(-1, 2) + 0.5) / 12
-    mean = np.mean([known(np.repeat(u[None], 20, 0), light, view) for u in grid], axis=0)
-    assert np.abs(found - mean).mean() < 0.1 * mean.mean()

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.object_stores import memory_store
+from support.object_stores import downloaded, memory_store
 from support.small_runs import command, contents, generate, noisy_plane
 
 from mbtf_core.app.console import run
@@ -46,15 +46,6 @@ def url(tmp_path: Path) -> Iterator[str]:
 def command_at(folder: Path, url: str, *more: str, **options: Any) -> list[str]:
     line = command(folder, Path("OUT"), **options)
     return [url if word == "OUT" else word for word in line] + list(more)
-
-
-def downloaded(url: str, folder: Path) -> Path:
-    """A local copy of everything in a store."""
-    store = ObjectStore(url)
-    folder.mkdir()
-    for name in store.list():
-        (folder / name).write_bytes(store.read(name))
-    return folder
 
 
 @pytest.mark.parametrize("suffix", ["npz", "exr"])
@@ -114,15 +105,13 @@ def test_the_manifest_of_another_writer_is_adopted(
     assert json.loads(ObjectStore(url).read("manifest.json"))["note"] == "theirs"
 
 
-@pytest.mark.parametrize("same", [True, False])
-def test_a_shard_without_sidecar_is_replaced(tmp_path: Path, url: str, same: bool) -> None:
+def test_a_shard_without_sidecar_is_replaced(tmp_path: Path, url: str) -> None:
     """A writer was killed between the two; another machine may compute other bits."""
     assert generate(command_at(tmp_path, url)) == 0
     expected = contents(downloaded(url, tmp_path / "before"))
     store = ObjectStore(url)
     store.delete("train-00001.json")
-    if not same:
-        store.write("train-00001.npz", b"other bits")
+    store.write("train-00001.npz", b"other bits")
     assert generate(command_at(tmp_path, url)) == 0
     assert contents(downloaded(url, tmp_path / "after")) == expected
 
@@ -203,8 +192,7 @@ def test_a_digest_names_no_file_elsewhere(tmp_path: Path, url: str) -> None:
 def test_shards_that_could_not_be_uploaded_wait(
     tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch, error: type[MbtfError]
 ) -> None:
-    """The connection ends during a run, or the credentials do: what is rendered is kept, and the next run
-    uploads it, also in the same process."""
+    """The connection ends during a run, or the credentials do: the next run uploads what is rendered."""
     assert generate(command(tmp_path, tmp_path / "local", train=200)) == 0
     rendered: list[str] = []
     original, estimate = ObjectStore.write, ClosedForm.estimate
@@ -303,13 +291,3 @@ def _documents_only(self: ObjectStore, name: str, content: bytes, *, new: bool =
     if name.startswith(("train", "test")):
         raise PartialError("the store cannot be reached")
     return _write(self, name, content, new=new)
-
-
-def test_a_corrupt_shard_is_not_read(tmp_path: Path, url: str) -> None:
-    assert generate(command_at(tmp_path, url)) == 0
-    store = ObjectStore(url)
-    flipped = bytearray(store.read("train-00001.npz"))
-    flipped[-100] ^= 1
-    store.write("train-00001.npz", bytes(flipped))
-    with pytest.raises(InputError, match=f"{url}/train-00001.npz: has changed since it was written"):
-        Dataset.open(url).load("train")

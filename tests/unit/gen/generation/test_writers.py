@@ -137,7 +137,6 @@ def test_the_run_that_ends_last_finishes_the_data_set(
     engine.estimated.clear()
     out.mkdir()
     lock = take_lock(out / FILES[1])
-    assert lock is not None
     estimate = engine.estimate
 
     def meanwhile(queries: Any, spp: int, stream: Any, **_: Any) -> Any:

@@ -9,11 +9,9 @@ import h5py
 import numpy as np
 import pytest
 from support import measured_files as files
-from support.datasets import write_dataset
 from support.measured_files import write_hdf5
 
 from mbtf_core.errors import InputError
-from mbtf_gen.measured.exported import export_neumip
 from mbtf_gen.measured.hdf5 import NeumipQueries, NeuralBtf
 
 TEXELS = files.ROWS * files.COLUMNS
@@ -53,17 +51,10 @@ def test_conventions(tmp_path: Path) -> None:
     assert all(queries[name].dtype == np.float32 for name in FIELDS)
 
 
-def test_a_flat_file_with_the_other_name(tmp_path: Path) -> None:
-    arrays = stored((24,), np.float32)
-    arrays["ground_light_dir"] = arrays.pop("ground_light")
-    flat = NeumipQueries(write_hdf5(tmp_path / "a.hdf5", arrays)).read(5, 9)
-    images = NeumipQueries(write_hdf5(tmp_path / "b.hdf5", stored())).read(5, 9)
-    for name in FIELDS:
-        np.testing.assert_array_equal(flat[name], images[name])
-
-
 def test_positions_wrap_and_a_radius_of_zero_is_a_texel(tmp_path: Path) -> None:
+    """The light may have its other name."""
     arrays = stored()
+    arrays["ground_light_dir"] = arrays.pop("ground_light")
     arrays["ground_camera_target_loc"][0, 0, 0] = [1.0, -1.25]
     arrays["ground_camera_query_radius"][:] = 0
     queries = NeumipQueries(write_hdf5(tmp_path / "a.hdf5", arrays)).read(0, 1)
@@ -92,11 +83,8 @@ def changed(**new: Any) -> dict[str, Any]:
     ("arrays", "message"),
     [
         (changed(ground_light=None), "no data set 'ground_light'"),
-        (changed(ground_color=None), "no data set 'ground_color'"),
-        (changed(ground_light=np.zeros((2, 3, 4, 3))), "the shape"),
         (changed(ground_camera_query_radius=np.zeros((2, 3, 5, 1))), "the shape"),
         (changed(ground_color=np.zeros((2, 3, 4, 3), np.int32)), "floats are expected"),
-        (changed(ground_color=np.zeros(3)), "the shape"),
         (changed(ground_color=np.zeros((0, 3, 4, 3))), "the shape"),
         (changed(ground_valid=np.ones((2, 3, 4, 1))), "rendering of a scene"),
     ],
@@ -106,36 +94,27 @@ def test_refused(arrays: dict[str, np.ndarray], message: str, tmp_path: Path) ->
         NeumipQueries(write_hdf5(tmp_path / "a.hdf5", arrays))
 
 
+def color(file: h5py.File, shape: tuple[int, ...] = (2, 3, 4, 3), **options: Any) -> h5py.Dataset:
+    return file.create_dataset("ground_color", shape, "f4", **options)
+
+
 def test_numbers_that_are_not_in_the_file(tmp_path: Path) -> None:
     path = write_hdf5(tmp_path / "a.hdf5", changed(ground_color=None))
     elsewhere = write_hdf5(tmp_path / "b.hdf5", stored())
-    shape = (2, 3, 4, 3)
-    with h5py.File(path, "r+") as file:
-        file["ground_color"] = h5py.ExternalLink(elsewhere.name, "ground_color")
-    with pytest.raises(InputError, match="of its own"):
-        NeumipQueries(path)
-    with h5py.File(path, "r+") as file:
-        del file["ground_color"]
-        file.create_dataset("ground_color", shape, "f4", external=[(str(elsewhere), 0, 288)])
-    with pytest.raises(InputError, match="of its own"):
-        NeumipQueries(path)
-    with h5py.File(path, "r+") as file:
-        del file["ground_color"]
-        file.create_dataset("ground_color", shape, "f4")
-    with pytest.raises(InputError, match="stores 0 of the 288 bytes"):
-        NeumipQueries(path)
-    with h5py.File(path, "r+") as file:
-        del file["ground_color"]
-        file.create_dataset("ground_color", shape, "f4", chunks=(1, 3, 4, 3))[0] = 1
-    with pytest.raises(InputError, match="stores 1 of the 2 chunks"):
-        NeumipQueries(path)
-    with h5py.File(path, "r+") as file:
-        del file["ground_color"]
-        file.create_dataset(
-            "ground_color", (10, 3, 4, 3), "f4", chunks=(10**7, 3, 4, 3), maxshape=(None, 3, 4, 3)
-        )
-    with pytest.raises(InputError, match="too large"):
-        NeumipQueries(path)
+    link = h5py.ExternalLink(elsewhere.name, "ground_color")
+    huge = {"chunks": (10**7, 3, 4, 3), "maxshape": (None, 3, 4, 3)}
+    for change, message in (
+        (lambda file: file.update(ground_color=link), "of its own"),
+        (lambda file: color(file, external=[(str(elsewhere), 0, 288)]), "of its own"),
+        (lambda file: color(file), "stores 0 of the 288 bytes"),
+        (lambda file: color(file, (10, 3, 4, 3), **huge), "too large"),
+    ):
+        with h5py.File(path, "r+") as file:
+            change(file)
+        with pytest.raises(InputError, match=message):
+            NeumipQueries(path)
+        with h5py.File(path, "r+") as file:
+            del file["ground_color"]
     (tmp_path / "d.hdf5").write_bytes(elsewhere.read_bytes()[:-100])
     with pytest.raises(InputError, match="cannot be read as HDF5"):
         NeumipQueries(tmp_path / "d.hdf5")
@@ -171,39 +150,6 @@ def test_images_of_the_known_function(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("name", "array", "message"),
-    [
-        ("ground_light", None, "no data set 'ground_light'"),
-        ("ground_light", np.zeros((8, 2)), "the shape"),
-        ("ground_camera_dir", np.zeros((9, files.ROWS, files.COLUMNS, 2)), "direction for each pixel"),
-        ("ground_camera_dir", np.full((9, 2), np.nan), "unit vectors"),
-        ("ground_camera_dir", np.full((9, 2), 0.8), "unit vectors"),
-        ("ground_light", np.ones((9, 2)) * [1, 0], None),
-        ("ground_color", np.zeros((9, 5, 4, 4)), "the shape"),
-        ("ground_color", np.zeros((9, 5, 4, 3), np.uint8), "floats are expected"),
-    ],
-)
-def test_images_that_are_refused(name: str, array: Any, message: str | None, tmp_path: Path) -> None:
-    arrays = {key: a for key, a in (images() | {name: array}).items() if a is not None}
-    path = write_hdf5(tmp_path / "a.hdf5", arrays)
-    if message is None:
-        assert NeuralBtf(path).left_out == 9
-        return
-    with pytest.raises(InputError) as caught:
-        NeuralBtf(path)
-    assert message in caught.value.message
-
-
-def test_nan_values_are_refused_where_they_are_used(tmp_path: Path) -> None:
-    arrays = images()
-    arrays["ground_color"][0, 1, 1, 1] = np.nan
-    btf = NeuralBtf(write_hdf5(tmp_path / "a.hdf5", arrays))
-    btf.values(np.array([0]), np.array([0]))
-    with pytest.raises(InputError, match="NaN or infinite"):
-        btf.values(np.array([0, 0]), np.array([0, files.COLUMNS + 1]))
-
-
 def test_numbers_that_a_file_cannot_have(tmp_path: Path) -> None:
     path = tmp_path / "a.hdf5"
     with h5py.File(path, "w") as file:
@@ -213,23 +159,3 @@ def test_numbers_that_a_file_cannot_have(tmp_path: Path) -> None:
         file["ground_light"] = file["ground_camera_dir"] = np.zeros((30, 2), np.float32)
     with pytest.raises(InputError, match="claims 94,371,840 bytes"):
         NeuralBtf(path)
-
-
-def test_an_export_for_neumip(tmp_path: Path) -> None:
-    """All that fills whole images, in the order of the shards; the program reads single precision too."""
-    data = write_dataset(
-        tmp_path / "data", queries={"train": "300", "test": "8"}, output={"shard_queries": 90}, rows=8
-    )
-    assert export_neumip(data, tmp_path / "a.hdf5") == 256
-    with h5py.File(tmp_path / "a.hdf5") as file:
-        assert {file[name].shape[:-1] for name in file} == {(1, 16, 16)}
-    found = NeumipQueries(tmp_path / "a.hdf5")
-    assert (found.count, found.base_radius) == (256, 0.5 / (1 << data.lattice.finest))
-    queries, whole = found.read(0, 256), data.load("train")
-    np.testing.assert_array_equal(queries["sigma"], whole["sigma"][:256])
-    distance = np.abs(queries["u"] - whole["u"][:256])
-    assert np.minimum(distance, 1 - distance).max() < 1e-7
-    for name in ("omega_i", "omega_o"):
-        np.testing.assert_array_equal(queries[name][:, :2], whole[name][:256, :2])
-    value = 0.5 * (whole["value_a"].astype(np.float64) + whole["value_b"])
-    np.testing.assert_allclose(queries["value"], value[:256], rtol=1e-6)

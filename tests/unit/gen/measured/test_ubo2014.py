@@ -30,25 +30,18 @@ def all_values(btf: Ubo2014) -> tuple[np.ndarray, np.ndarray]:
     return btf.values(pair, texel), files.value(row, column, light, view)
 
 
-@pytest.mark.parametrize("model", [0, 1, 3, 4, 9, 11, 12])
+@pytest.mark.parametrize(
+    ("model", "width", "tolerance"),
+    [*((m, 4, 2e-4) for m in (0, 1, 3, 4, 9, 11, 12)), (0, 2, 5e-3), (0, 8, 1e-5)],
+)
 @pytest.mark.parametrize("transposed", [False, True])
-def test_the_known_function(model: int, transposed: bool, tmp_path: Path) -> None:
-    btf = opened(tmp_path, files.btf(model, 4, transposed))
+def test_the_known_function(
+    model: int, width: int, tolerance: float, transposed: bool, tmp_path: Path
+) -> None:
+    btf = opened(tmp_path, files.btf(model, width, transposed))
     assert (btf.rows, btf.columns, btf.left_out, btf.cosine) == (files.ROWS, files.COLUMNS, 3, True)
     values, expected = all_values(btf)
-    np.testing.assert_allclose(values, expected, rtol=2e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize(("width", "tolerance"), [(2, 5e-3), (8, 1e-5)])
-def test_widths_of_numbers(width: int, tolerance: float, tmp_path: Path) -> None:
-    values, expected = all_values(opened(tmp_path, files.btf(0, width)))
-    np.testing.assert_allclose(values, expected, rtol=tolerance, atol=tolerance)
-
-
-def test_directions_are_lights_within_views(tmp_path: Path) -> None:
-    btf = opened(tmp_path, files.btf())
-    np.testing.assert_allclose(btf.light, np.tile(files.unit(files.LIGHTS), (3, 1)), atol=1e-6)
-    np.testing.assert_allclose(btf.view, np.repeat(files.unit(files.VIEWS[:3]), 3, axis=0), atol=1e-6)
+    np.testing.assert_allclose(values, expected, rtol=tolerance, atol=tolerance / 100)
 
 
 @pytest.mark.parametrize(
@@ -94,18 +87,13 @@ def broken() -> dict[str, bytes]:
         "the version 9": patched(good, 14, struct.pack("<I", 9)),
         "header of": patched(good, 10, struct.pack("<I", 99)),
         "claims 1,000,000,000 views": patched(good, views, huge),
-        "claims 1,000,000,000 lights": patched(good, views + 12, huge),
         "lights of view 1": patched(good, views + 16 + 24 + 8, struct.pack("<I", 2)),
         "NaN or infinite numbers in its directions": patched(good, views + 4, struct.pack("<f", np.nan)),
-        "polar angles": patched(good, views + 4, struct.pack("<f", -1.0)),
         "claims images of 1000000000 x 5 texels": patched(good, size, huge),
-        "texels; 1 to 16,384 across": patched(good, size, struct.pack("<I", 16_385)),
-        "claims images of 0 x 5": patched(good, size, bytes(4)),
         "ends within the rotations": patched(good, size + 8, huge),
         "the color model 2": patched(good, model, struct.pack("<i", 2)),
         "numbers of 3 bytes": patched(good, factors, b"\3"),
         "claims 1,000,000,000 components": patched(good, factors + 1, huge),
-        "ends within the factors of channel 0": patched(good, factors + 1, struct.pack("<I", 60_000)),
         "not those of 12 pairs and 20 texels": patched(good, factors + 5, struct.pack("<I", 13)),
         "ends within the factors of channel 2": good[:-1],
         "3 bytes after": good + b"abc",
@@ -124,8 +112,3 @@ def test_nan_factors_are_refused_where_they_are_used(tmp_path: Path) -> None:
     btf.values(np.array([0]), np.array([0]))
     with pytest.raises(InputError, match="NaN or infinite"):
         btf.values(np.array([0, 1]), np.array([TEXELS - 1, 0]))
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("btf")

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import Queries
-from mbtf_gen.planning.adaptive import DOUBT, MOST_CORRECTION, PRIOR_PATHS, correction, needed_paths, round_up
+from mbtf_gen.planning.adaptive import MOST_CORRECTION, correction, needed_paths
 from mbtf_gen.planning.sample_allocation import (
-    FLOOR,
     Allocation,
     direction_terms,
     evaluate_terms,
@@ -65,16 +64,6 @@ def test_a_group_of_lights_has_the_paths_that_its_noise_takes() -> None:
     assert 1.0 < found.gain < alone.gain
 
 
-def test_a_log_linear_mean_is_recovered() -> None:
-    rng = np.random.default_rng(0)
-    x = rng.normal(size=20_000)
-    weights = fit_log_linear([np.ones_like(x), x], np.exp(0.5 * x - 3.0) * rng.exponential(size=len(x)))
-    assert weights == pytest.approx([-3.0, 0.5], abs=0.05)
-    nothing = fit_log_linear([np.ones_like(x), x], np.zeros_like(x))
-    assert nothing is not None
-    assert not nothing.any()
-
-
 def glossy_pilot(q: Queries, seed: int) -> Estimates:
     """Noise of a sharp lobe, large where the half vector is the normal and seen by few paths."""
     half = q.omega_i.astype(np.float64) + q.omega_o
@@ -91,7 +80,6 @@ def test_a_sharp_lobe_is_fitted_to_the_end() -> None:
     found = glossy_pilot(q, 1)
     noise = np.sqrt(np.mean((found.value_a.astype(np.float64) - found.value_b) ** 2, axis=-1))
     weights = fit_log_linear(direction_terms(q), noise)
-    assert weights is not None
     fit = np.exp(np.stack(direction_terms(q), axis=1) @ weights)
     # The constant has no ridge, so this holds at the optimum and nowhere else along it.
     assert fit.mean() == pytest.approx(noise.mean(), rel=1e-3)
@@ -103,20 +91,12 @@ def test_a_sharp_lobe_is_fitted_to_the_end() -> None:
     assert np.mean(s**2) == pytest.approx(0.25 * SPP * np.mean(noise**2), rel=1e-3)
 
 
-def test_a_failed_fit_gives_even_counts(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_failed_fit_gives_even_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     q = some_queries(2000)
     found = glossy_pilot(q, 1)
     monkeypatch.setattr("mbtf_gen.planning.sample_allocation._STEPS", 2)
     allocation = fit_allocation(q, found, SPP, 12)
-    assert caplog.messages == [
-        "the fit of the tile mean over directions did not converge; a constant is used",
-        "the fit of the noise over queries did not converge; a constant is used",
-    ]
     assert (allocation.counts(q, 12) == 12).all()
-    difference = found.value_a.astype(np.float64) - found.value_b
-    assert allocation.deviation(q) ** 2 == pytest.approx(np.full(2000, 0.25 * SPP * np.mean(difference**2)))
     mean = 0.5 * np.mean(found.value_a.astype(np.float64) + found.value_b)
     assert allocation.tile_mean(q) == pytest.approx(np.full(2000, mean))
 
@@ -156,37 +136,12 @@ def test_counts_of_a_query_do_not_depend_on_the_others(fitted: Allocation) -> No
     assert (fitted.counts(some, SPP) == fitted.counts(q, SPP)[7:9]).all()
 
 
-def test_no_noise_and_little_noise() -> None:
+def test_no_noise_gives_even_counts() -> None:
     q = some_queries(500)
     value = np.full((500, 3), 0.1, np.float32)
     silent = fit_allocation(q, Estimates(value, value, None, 0, 0, 0, 0), SPP, SPP)
     assert (silent.counts(q, SPP) == SPP).all()
     assert silent.gain == 1.0
-    lonely = value.copy()
-    lonely[3] = 1.0
-    found = fit_allocation(q, Estimates(lonely, value, None, 0, 0, 0, 0), SPP, SPP)
-    assert found.deviation(q).min() >= FLOOR * found.typical > 0
-
-
-def test_counts_under_a_target_are_rounded_up() -> None:
-    needed = np.array([0.0, 2.0, 2.1, 4.1, 6.0, 6.1, 9.0, 12.1, 500.0, 1e9])
-    assert round_up(needed, 1000).tolist() == [2, 2, 4, 6, 6, 8, 12, 16, 512, 1000]
-
-
-def test_paths_for_a_target_error() -> None:
-    n = 4
-    value = np.array([0.1, 2.0, 0.0, 0.1], np.float32)[:, None].repeat(3, axis=1)
-    variance = np.array([0.01, 0.01, 0.0, 0.01], np.float32)
-    found = Estimates(value, value, None, 0, 0, 0, 0, path_variance=variance)
-    needed, scale = needed_paths(found, 16, np.full(n, 0.1), np.array([0.2, 0.2, 0.2, 0.0]), 0.05)
-    # The tile mean, or a value that is well above it.
-    assert scale == pytest.approx([0.2, 2.0, 0.2, 0.1], rel=0.15)
-    # Where pilot and expectation agree, the variance over the square of what is allowed.
-    shrunken = 2.0 - DOUBT * 0.01 / 16 / 1.8
-    assert needed[:2] == pytest.approx([0.01 / (0.05 * 0.2) ** 2, 0.01 / (0.05 * shrunken) ** 2])
-    # A pilot that saw nothing does not overrule the expectation.
-    assert needed[2] == pytest.approx(0.01 * PRIOR_PATHS / (15 + PRIOR_PATHS) / (0.05 * 0.2) ** 2)
-    assert needed[3] == pytest.approx(0.01 / (0.05 * (0.1 - DOUBT * 0.01 / 16 / 0.1)) ** 2)
 
 
 def test_an_expectation_below_the_pilots_is_raised() -> None:
@@ -200,19 +155,11 @@ def test_an_expectation_below_the_pilots_is_raised() -> None:
         assert correction(variance, deviation, mean) == pytest.approx(expected, rel=0.05)
         variance[7] = 1e6
         assert correction(variance, deviation, mean) == pytest.approx(expected, rel=0.08)
-    # Where the dark ones are the noisy ones, they count.
-    dark = mean < np.median(mean)
-    assert correction(np.where(dark, 2.0, 0.7) * deviation**2, deviation, mean) == pytest.approx(
-        1.16, rel=0.02
-    )
     # Too few say nothing; nor does black.
     assert correction(9.0 * deviation[:100] ** 2, deviation[:100], mean[:100]) == 1.0
     assert correction(np.zeros(n), np.zeros(n), np.zeros(n)) == 1.0
-    found = Estimates(
-        *np.zeros((2, n, 3), np.float32), None, 0, 0, 0, 0, path_variance=np.zeros(n, np.float32)
-    )
-    assert found.path_variance is not None
-    found.path_variance[:] = (1.5 * deviation) ** 2
+    variance = ((1.5 * deviation) ** 2).astype(np.float32)
+    found = Estimates(*np.zeros((2, n, 3), np.float32), None, 0, 0, 0, 0, path_variance=variance)
     needed, _ = needed_paths(found, 16, deviation, mean, 0.05)
     assert needed == pytest.approx(np.full(n, (1.5 * 0.3 / 0.05) ** 2), rel=1e-5)
 

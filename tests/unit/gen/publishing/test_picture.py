@@ -13,7 +13,7 @@ from support.fit_data import write_data
 from support.published import LAYOUTS, small
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_gen.publishing.picture import brdf_image, tile_images, visible_positions, write_picture
+from mbtf_gen.publishing.picture import brdf_image, tile_images, write_picture
 
 
 def test_images_have_v_and_the_light_where_they_belong(tmp_path: Path) -> None:
@@ -55,21 +55,6 @@ def test_few_queries_show_ridges(tmp_path: Path) -> None:
     wave = np.cos(8 * np.pi * (np.arange(len(profile)) + 0.5) / len(profile))
     # 0.15; of lights above 20° and higher views, 0.07.
     assert 2 * (profile * wave).mean() > 0.11
-
-
-def test_parallax_is_removed_where_heights_are_known() -> None:
-    """The tile is twice as wide as high; its half v > 1/2 is deeper."""
-    heights = np.full((64, 128), -0.02, np.float32)
-    heights[:32] = -0.1
-    heights[0, 0] = 0.0
-    geometry = SimpleNamespace(heights=heights, aspect=0.5)
-    u = np.array([[0.5, 0.75], [0.5, 0.25], [0.98, 0.2]])
-    view = np.array([[0.6, 0.0, 0.8], [0.0, 0.6, 0.8], [-0.6, 0.0, 0.8]])
-    # At slopes of 3/4.
-    expected = [[0.5 - 0.075, 0.75], [0.5, 0.25 - 2 * 0.015], [0.995, 0.2]]
-    seen = visible_positions(u, view, geometry)  # type: ignore[arg-type]
-    np.testing.assert_allclose(seen, expected, atol=2 * 0.1 / 48)
-    assert visible_positions(np.array([[0.99, 0.7]]), view[2:], geometry)[0, 0] < 0.07  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

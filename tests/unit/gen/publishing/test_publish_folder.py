@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import pytest
-from support.datasets import write_dataset
-from support.published import contents, publish, small
+from support.published import LAYOUTS, contents, publish, small
 
-from mbtf_core.errors import InputError, UsageError
+from mbtf_core.data.verify import verify
+from mbtf_core.errors import InputError
 from mbtf_gen.config.exchange import PublishConfig
 from mbtf_gen.publishing.publication import Publication
-
-CONFIG = PublishConfig(license="CC0-1.0", form="parquet")
 
 
 @pytest.fixture
@@ -27,24 +24,6 @@ def test_the_same_command_gives_the_same_bytes(form: str, shards: Path, tmp_path
     pytest.importorskip("pyarrow")
     first, second = (publish(shards, tmp_path / name, form=form) for name in ("a", "b"))
     assert contents(first) == contents(second)
-
-
-def test_what_has_changed_is_replaced_on_request_only(shards: Path, tmp_path: Path) -> None:
-    card = publish(shards, tmp_path / "card", form="parquet")
-    whole = contents(card)
-    for name in ("README.md", "croissant.json", "data/train-00000.parquet"):
-        content = bytearray(whole[name])
-        content[len(content) // 2] ^= 1
-        (card / name).write_bytes(content)
-        with pytest.raises(InputError, match=f"{name}: has been edited, or damaged"):
-            publish(shards, card, form="parquet")
-        assert (card / name).read_bytes() == content
-        (card / name).unlink()
-        publish(shards, card, form="parquet")
-        assert contents(card) == whole
-    (card / "README.md").write_text("mine")
-    Publication.prepare(shards, CONFIG).write(card, overwrite=True)
-    assert contents(card) == whole
 
 
 def test_other_options_are_refused_and_replace(shards: Path, tmp_path: Path) -> None:
@@ -71,18 +50,30 @@ def test_damage_is_found_before_anything_is_written(shards: Path, tmp_path: Path
     assert not (tmp_path / "card").exists()
 
 
-def test_a_full_disk_is_said_before(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "mbtf_core.files.folders.shutil.disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, 1000)
-    )
-    with pytest.raises(InputError, match=r"needs .* MB; 1 kB are free"):
-        publish(shards, tmp_path / "card", form="parquet")
-    assert not (tmp_path / "card").exists()
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("formats")
+    for layout in LAYOUTS:
+        small(folder / layout, layout)
+    return folder
 
 
-def test_shards_of_exr_are_not_npz(tmp_path: Path) -> None:
-    write_dataset(tmp_path / "data", queries={"train": "40", "test": "8"}, output={"format": "exr"})
-    with pytest.raises(UsageError, match="holds shards of another format"):
-        publish(tmp_path / "data", tmp_path / "card", form="npz")
-    card = publish(tmp_path / "data", tmp_path / "card", form="parquet")
-    assert (card / "data/train-00000.parquet").exists()
+def test_shards_are_published_as_they_are(work: Path, tmp_path: Path) -> None:
+    card = publish(work / "shuffled", tmp_path / "card", form="npz")
+    assert verify(card / "data") == []
+    mine, theirs = contents(work / "shuffled"), contents(card / "data")
+    assert set(mine) == set(theirs)
+    changed = {name for name in mine if mine[name] != theirs[name]}
+    assert changed == {"manifest.json", "config.yaml"}
+    # Nobody learns where the author keeps the material.
+    for content in contents(card).values():
+        assert str(work).encode() not in content
+
+
+def test_links_do_not_change_with_the_data_set(tmp_path: Path) -> None:
+    small(tmp_path / "data")
+    card = publish(tmp_path / "data", tmp_path / "card", form="npz")
+    before = contents(card)
+    (tmp_path / "data/train-00000.npz").unlink()
+    (tmp_path / "data/train-00000.npz").write_bytes(b"other")
+    assert contents(card) == before

@@ -86,17 +86,3 @@ def test_changed_and_lost_maps_are_refused(tmp_path: Path) -> None:
         Publication.prepare(tmp_path / "data", CONFIG, with_maps=True)
     with pytest.raises(UsageError, match="goes with --with-maps"):
         Publication.prepare(tmp_path / "data", CONFIG, material=tmp_path / "moved")
-
-
-@pytest.mark.usefixtures("engine")
-def test_a_weave_is_published_without_maps(tmp_path: Path) -> None:
-    cloth = tmp_path / "cloth.yaml"
-    cloth.write_text("{weave: twill 2/1, yarn: {fibers: 2}, resolution: 8}\n")
-    generation.generate(GeneratorConfig.model_validate({"material": str(cloth), **SMALL}), tmp_path / "data")
-    card = tmp_path / "card"
-    Publication.prepare(tmp_path / "data", CONFIG).write(card)
-    cloth.write_text("{weave: plain, yarn: {fibers: 2}, resolution: 8}\n")
-    made = remade(card, tmp_path / "made")
-    assert made.manifest["inputs"] == Dataset.open(card / "data").manifest["inputs"]
-    # Another weave of that name is not what the data are of.
-    assert not Publication.prepare(tmp_path / "data", CONFIG).maps

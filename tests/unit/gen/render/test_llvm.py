@@ -1,16 +1,18 @@
-"""The LLVM library: found without the user, and never the cause of an abort."""
+"""The LLVM library: found without the user, never the cause of an abort; its threads and memory."""
 
 from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from conftest import RunPython
 
 from mbtf_core.errors import EngineError
-from mbtf_core.run.processes import run_child
+from mbtf_core.run.task import THREADS_VARIABLE
 from mbtf_gen.engine import runtime as engine
 
 LOAD = """
@@ -23,18 +25,7 @@ except MbtfError as error:
 """
 
 
-def old_llvm(major: int) -> str:
-    """Path of a system library of that version, or skip."""
-    places = [
-        f"/usr/lib/x86_64-linux-gnu/libLLVM-{major}.so.1",
-        f"/usr/lib/aarch64-linux-gnu/libLLVM-{major}.so.1",
-        f"/usr/lib/llvm-{major}/lib/libLLVM-{major}.so.1",
-        f"/usr/lib64/libLLVM-{major}.so",
-    ]
-    for place in places:
-        if Path(place).exists():
-            return place
-    pytest.skip(f"no LLVM {major} on this machine")
+OLD = sorted(Path("/usr/lib").glob("*/libLLVM-1[0-5].so.1"))
 
 
 def test_it_is_found_and_works_with_nothing_set(run_python: RunPython, tmp_path: Path) -> None:
@@ -50,16 +41,9 @@ def test_it_is_found_and_works_with_nothing_set(run_python: RunPython, tmp_path:
     assert any(p.name.startswith("llvm-proof-") for p in (tmp_path / "mbtf").iterdir())
 
 
-def test_a_path_the_user_set_wins(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(engine.VARIABLE, "/somewhere/libLLVM.so.99")
-    monkeypatch.delenv(engine.CACHE_VARIABLE, raising=False)
-    engine.use_shipped_llvm()
-    assert os.environ[engine.VARIABLE] == "/somewhere/libLLVM.so.99"
-    assert os.environ[engine.CACHE_VARIABLE].endswith("kernels-libLLVM.so.99")
-
-
+@pytest.mark.skipif(not OLD, reason="no LLVM older than 16 on this machine")
 def test_an_old_llvm_is_refused(run_python: RunPython) -> None:
-    done = run_python("-c", LOAD, DRJIT_LIBLLVM_PATH=old_llvm(15))
+    done = run_python("-c", LOAD, DRJIT_LIBLLVM_PATH=str(OLD[-1]))
     assert done.returncode == 0
     assert "is older than LLVM 16" in done.stdout
     assert done.stderr == ""
@@ -68,7 +52,6 @@ def test_an_old_llvm_is_refused(run_python: RunPython) -> None:
 def test_an_installation_never_started_by_its_owner_works(run_python: RunPython, tmp_path: Path) -> None:
     # Links of the C++ runtime appear at the first start that may write; here they never did.
     shipped = engine.shipped_llvm()
-    assert shipped is not None
     runtime = sorted({p.resolve() for p in shipped.parent.glob("*-linux-gnu/lib*.so.*")})
     if not runtime:
         pytest.skip("the library brings no C++ runtime on this platform")
@@ -122,18 +105,42 @@ def test_a_failed_proof_is_not_cached(monkeypatch: pytest.MonkeyPatch) -> None:
             engine.check_llvm()
 
 
-# What a child of the test below runs.
+SHOWN = """
+from mbtf_gen.engine.runtime import load_mitsuba
+load_mitsuba()
+import drjit
+print(drjit.thread_count())
+"""
 
 
-def prove_whatever_the_version():  # type: ignore[no-untyped-def]
-    engine.OLDEST_LLVM = 0
-    engine.has_version = lambda library: True
-    yield from engine._proof(engine.CPU_VARIANT)
+def test_a_worker_renders_with_its_threads() -> None:
+    environment = {**os.environ, THREADS_VARIABLE: "3"}
+    shown = subprocess.run([sys.executable, "-c", SHOWN], env=environment, capture_output=True, text=True)
+    assert shown.stdout.split() == ["3"], shown.stderr
 
 
-def test_the_proof_catches_the_abort_of_llvm_15(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Without the version check, the test kernels end the child in the way they would end a render."""
-    monkeypatch.setenv(engine.VARIABLE, old_llvm(15))
-    environment = {engine.CACHE_VARIABLE: str(tmp_path)}
-    outcome = run_child(__name__, "prove_whatever_the_version", timeout=60, environment=environment)
-    assert "ended by SIGABRT" in outcome.fault
+# Numbers at the end of readable memory.
+CODE = """
+import ctypes, mmap, sys
+import numpy as np
+from mbtf_gen.engine.types import padded
+from mbtf_gen.engine.runtime import load_mitsuba
+mi = load_mitsuba()
+import drjit as dr
+half, n = 1 << 19, 1601
+memory = mmap.mmap(-1, 2 * half)
+start = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+assert ctypes.CDLL(None).mprotect(ctypes.c_void_p(start + half), half, 0) == 0
+numbers = np.frombuffer(memory, np.uint32, count=n, offset=half - 4 * n)
+if sys.argv[1] == "padded":
+    numbers = padded(numbers)
+copied = mi.UInt32(numbers) + dr.opaque(mi.UInt32, 1)
+dr.eval(copied)
+assert (np.array(copied) == 1).all()
+"""
+
+
+def test_kernels_stay_within_the_memory_of_the_process(run_python: RunPython) -> None:
+    assert run_python("-c", CODE, "padded").returncode == 0
+    # Where this passes, Dr.Jit reads no further any more, and nothing needs to be padded.
+    assert run_python("-c", CODE, "plain").returncode != 0

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from PIL import Image
 from support.paths import ASSETS
 
-from mbtf_gen import load_material
-
 # Material → does it state a constant beside its maps?
 MATERIALS = {
     "twisted_wool": True,
@@ -60,14 +58,3 @@ def test_the_script_makes_the_stored_files(
             assert np.array_equal(pixels(new), pixels(stored)), name
         else:
             assert new.read_bytes() == stored.read_bytes(), name
-
-
-@pytest.mark.parametrize("name", MATERIALS)
-def test_materials_load_without_a_warning(name: str) -> None:
-    material = load_material(ASSETS / name)
-    assert material.warnings == ()
-    assert set(material.files) == {"height", "base_color", "roughness"}
-    assert material.height_scale == 1
-    # Wool and rock refract more than the customary 1.5 (s = 0.5), none of them much.
-    assert isinstance(material.maps["specular"], float)
-    assert 0.5 < material.maps["specular"] < 0.6 if MATERIALS[name] else material.maps["specular"] == 0.5

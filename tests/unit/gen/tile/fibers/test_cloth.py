@@ -10,9 +10,8 @@ import pytest
 from support.paths import ASSETS
 
 from mbtf_core.errors import InputError
-from mbtf_gen.config.generator import GeometrySection
 from mbtf_gen.tile.cloth import loose_ends
-from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile, absorption
+from mbtf_gen.tile.fiber_tile import FiberTile, absorption
 from mbtf_gen.tile.fibers.curves import Bundle, Curve
 from mbtf_gen.tile.loading import load_material
 
@@ -29,9 +28,7 @@ def write(tmp_path: Path, text: str) -> Path:
 
 
 def fibers(tmp_path: Path, text: str) -> Any:
-    found = load_material(write(tmp_path, text))
-    assert found is not None
-    return found
+    return load_material(write(tmp_path, text))
 
 
 def test_a_weave_has_the_yarns_of_its_draft(tmp_path: Path) -> None:
@@ -51,20 +48,14 @@ def test_a_weave_has_the_yarns_of_its_draft(tmp_path: Path) -> None:
 
 
 def test_every_option_changes_the_digest(tmp_path: Path) -> None:
-    yarns = "yarns: {a: 0.5, b: '#808080'}\nwarp: a b\n"
     keys = "color 0.1,width 0.5,height 0.9,flyaways 2,radius 2,roughness 0.5,azimuthal_roughness 0.5"
-    texts = [
-        WEAVE,
-        *(WEAVE.replace(*pair) for pair in (("plain", "basket 2"), ("silk1", "silk2"), ("s: 3", "s: 4"))),
-        *(
-            WEAVE + more
-            for more in ("repeat: 2\n", "seed: 1\n", "resolution: 64\n", yarns, yarns + "weft: a\n")
-        ),
-        *(
-            WEAVE.replace("}", f", {key.replace(' ', ': ')}}}")
-            for key in f"{keys},scale_tilt 1,ior 1.4".split(",")
-        ),
+    yarn = [
+        WEAVE.replace("}", f", {k.replace(' ', ': ')}}}") for k in f"{keys},scale_tilt 1,ior 1.4".split(",")
     ]
+    other = [WEAVE.replace(*p) for p in (("plain", "basket 2"), ("silk1", "silk2"), ("s: 3", "s: 4"))]
+    yarns = "yarns: {a: 0.5, b: '#808080'}\nwarp: a b\n"
+    more = ("repeat: 2\n", "seed: 1\n", "resolution: 64\n", yarns, yarns + "weft: a\n")
+    texts = [WEAVE, *yarn, *other, *(WEAVE + text for text in more)]
     digests = {str(load_material(write(tmp_path, text)).digests) for text in texts}
     assert len(digests) == len(texts)
 
@@ -73,31 +64,18 @@ def test_every_option_changes_the_digest(tmp_path: Path) -> None:
     ("text", "says"),
     [
         ("weave: plain\nknit: {}\n", "one of"),
-        ("yarn: {}\nweave: tweed\n", "houndstooth"),
-        ("weave: velvet\n", "curves"),
-        ("weave: jersey\n", "knit"),
         ("knit: {}\nrepeat: 2\n", "goes with"),
-        ("weave: plain\nyarn: {type: nylon}\n", "type"),
-        ("weave: plain\nheight: h.exr\n", "height"),
         ("pattern: missing.pyp\n", "no such file"),
         ("weave: basket 64\nrepeat: 64\n", "crossings"),
         ("weave: basket 9\nyarn: {fibers: 90000}\n", "segments"),
-        ("weave: plain\nyarn: {width: 0.00001}\n", "segments"),
-        ("weave: plain\nyarn: {flyaways: 100, width: 0.001}\n", "segments"),
         ("weave: plain\nyarn: {width: 1000000}\n", "periods"),
         ("weave: plain\nyarn: {radius: 0.001, fibers: 2}\n", "thinner"),
         ("weave: |\n" + "  X\n" * 100, "times as long"),
-        ("weave: plain\nyarn: {roughness: 0.01}\n", "roughness"),
-        ("weave: plain\nyarn: {color: '#12345'}\n", "#rrggbb"),
         ("weave: plain\nyarns: {a: 1}\n", "sequence"),
         ("weave: plain\nyarns: {red: 1, rest: 0}\nwarp: red\n", "'rest' is in neither"),
         ("weave: plain\nyarns: {red: 1}\nwarp: rde4\n", "did you mean 'red'"),
-        ("weave: plain\nweft: a\n", "goes with 'warp'"),
-        ("knit: {}\nyarns: {a: 1}\n", "goes with"),
         ("weave: houndstooth\n", "two yarns"),
         ("weave: twill 3/1\nyarns: {a: 1, b: 0}\nwarp: a601 b\nweft: a499 b\n", "1204 warps"),
-        ("knit: {aspect: 0.5}\n", "aspect"),
-        ("curves: a.curves\nyarn: {flyaways: 2}\n", "flyaways"),
         ("curves: a.curves\nseed: 2\n", "seed"),
     ],
 )
@@ -116,19 +94,14 @@ def test_yarns_keep_what_they_do_not_give_themselves(tmp_path: Path) -> None:
     found = fibers(tmp_path, text)
     assert found.names == ("blue", "ecru")
     assert found.colors == pytest.approx(np.array([[0.0, 0.0, 1.0], [0.7, 0.6, 0.5]]))
-    assert [(s.roughness, s.azimuthal_roughness, s.ior) for s in found.scattering] == [
-        (0.5, 0.41, 1.4),
-        (0.2, 0.41, 1.4),
-    ]
+    parameters = [(s.roughness, s.azimuthal_roughness, s.ior) for s in found.scattering]
+    assert parameters == [(0.5, 0.41, 1.4), (0.2, 0.41, 1.4)]
     # Four warps of four plies of three fibers, four wefts of seven, which are twice as thick.
     assert np.bincount(found.yarn).tolist() == [48, 112]
     thin, thick = (
         {float(found.curves[k].control[0, 3]) for k in np.flatnonzero(found.yarn == y)} for y in (0, 1)
     )
     assert max(thick) == pytest.approx(2.0 * max(thin))
-    shown = found.describe(found.inspect(GeometrySection()), "cloth.yaml")
-    assert "bbbe" in shown
-    assert "4 warps and 4 wefts" in shown
 
 
 def test_sequences_begin_at_the_left_and_at_the_top(tmp_path: Path) -> None:
@@ -164,38 +137,18 @@ def test_radii_of_files_are_divided_by_the_width_of_the_period(
     assert curve.control[:, 3] == pytest.approx(factor * 0.01)
 
 
-@pytest.mark.parametrize(
-    ("key", "content", "more"),
-    [
-        ("curves", "".join(f"{x / 4} 0.5 0 .01\n" for x in range(-1, 6)), "period: [1, 1]\n"),
-        (
-            "pattern",
-            "*pattern\n4 4 .5 4\n*Q\n0 1 0 0\n1 1 0 0\n2 1 0 0\n3 1 0 0\n"
-            "*E\n0 1 0 0\n1 2 0 0\n2 3 0 0\n3 0 1 0\n",
-            "yarn: {fibers: 2, flyaways: 0}\n",
-        ),
-    ],
-)
-def test_a_changed_file_is_another_data_set(tmp_path: Path, key: str, content: str, more: str) -> None:
+def test_a_changed_file_is_another_data_set(tmp_path: Path) -> None:
+    content = "".join(f"{x / 4} 0.5 0 .01\n" for x in range(-1, 6))
+    path = write(tmp_path, "curves: fibers.txt\nperiod: [1, 1]\n")
     (tmp_path / "fibers.txt").write_text(content)
-    path = write(tmp_path, f"{key}: fibers.txt\n{more}")
     before = load_material(path).digests
-    assert set(before) == {key, "settings"}
     # As many bytes as before.
-    (tmp_path / "fibers.txt").write_text(
-        content.replace("0.5 0 .01", "0.4 0 .01").replace("1 1 0 0", "1 1 1 0")
-    )
-    assert load_material(path).digests[key] != before[key]
+    (tmp_path / "fibers.txt").write_text(content.replace("0.5 0 .01", "0.4 0 .01"))
+    assert load_material(path).digests["curves"] != before["curves"]
 
 
 def test_fibers_are_the_same_on_every_machine() -> None:
     """Shards of one data set may come from several."""
     found = load_material(ASSETS / "basket_weave")
-    assert isinstance(found, FiberTile)
     points = np.concatenate([curve.control for curve in found.curves])
     assert points.sum() == pytest.approx(GOLDEN, abs=1e-6)
-
-
-def test_narrow_lobes_are_found_along_and_around_the_fiber() -> None:
-    assert FiberScattering(0.72, 0.6).narrowest == pytest.approx(np.radians(27.0), rel=0.02)
-    assert FiberScattering(0.72, 0.02).narrowest < np.radians(1.0)

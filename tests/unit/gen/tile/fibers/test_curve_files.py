@@ -10,11 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.fuzzing import damaged, examples, loads_or_refuses
-from support.paths import ROOT
 
 from mbtf_core.errors import InputError
-from mbtf_gen.config.generator import GeometrySection
-from mbtf_gen.tile.fiber_tile import FiberTile
 from mbtf_gen.tile.fibers import curve_file, weave
 from mbtf_gen.tile.fibers.cloth_file import CURVE_FILES
 from mbtf_gen.tile.fibers.curve_file import read_curves
@@ -66,45 +63,16 @@ def test_a_pattern_has_the_yarns_of_its_edges(tmp_path: Path) -> None:
     assert yarn.points[:, 0] == pytest.approx([0.125, 0.375, 0.625, 0.875])
 
 
-@pytest.mark.parametrize("name", ["stock_9", "basket_9", "satin_9"])
-def test_published_patterns(name: str) -> None:
-    """Of Sperl et al. 2021: all vertices are used, and no yarn jumps, also from its end to its start."""
-    path = ROOT.parent / f"shared/data/yarn/{name}.pyp"
-    if not path.exists():
-        pytest.skip(f"{path.name} is not beside the project")
-    width, height, radius, vertices = map(float, path.read_text().splitlines()[1].split())
-    pattern = read_pattern(path)
-    assert (pattern.aspect, pattern.radius) == pytest.approx((height / width, radius / width))
-    assert sum(len(yarn.points) for yarn in pattern.yarns) == vertices
-    for yarn in pattern.yarns:
-        end = yarn.points[0] + [*yarn.shift * (1.0, pattern.aspect), 0.0]
-        steps = np.linalg.norm(np.diff([*yarn.points, end], axis=0), axis=1)
-        assert steps.max() < 3 * np.median(steps)
-    tile = load_material(path).configured(GeometrySection())
-    assert isinstance(tile, FiberTile)
-    assert tile.aspect == pytest.approx(pattern.aspect)
-    assert 2 * pattern.radius < tile.thickness < 1
-
-
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
         ("0.004 0.002", "-0.004 0.002", "positive"),
-        ("*E", "*F", "'*E'"),
         ("0.0015 0.0005 0.0002 0", "0.0015 nan 0.0002 0", "line 5"),
-        ("0.0015 0.0005 0.0002 0", "0.0015 0.0005", "line 5"),
         ("3 0 1 0", "3 9 1 0", "beyond"),
         ("3 0 1 0", "3 2 1 0", "closed yarns"),
-        ("3 0 1 0\n", "", "closed yarns"),
-        ("1 2 0 0", "1 2.5 0 0", "indices"),
-        ("*pattern", "", "*pattern"),
         ("3 0 1 0", "3 0 100000000 0", "indices"),
-        ("3 0 1 0", "3 0 1e300 0", "indices"),
         ("3 0 1 0", "3 0 90 0", "periods"),
-        ("0.0005 0.0005 0 0", "0.0005 1e200 0 0", "periods"),
         ("0.0015 0.0005 0.0002 0", "0.0005 0.0005 0 0", "same place"),
-        ("0.0003 1", "-0.0003 1", "positive"),
-        ("0.0003 1", "nan 1", "line 2"),
         ("0.0003 1", "1_0 1", "line 2"),
     ],
 )
@@ -119,12 +87,11 @@ def test_a_bcc_has_open_and_closed_curves_through_its_points(tmp_path: Path) -> 
     rng = np.random.default_rng(0)
     points, ring = rng.random((6, 3)), rng.random((5, 3))
     path = tmp_path / "a.bcc"
-    for up in (2, 1):
-        path.write_bytes(bcc([(points, False), (ring, True)], up))
+    for up, sizes in ((2, 0x44), (1, 0x88)):
+        path.write_bytes(bcc([(points, False), (ring, True)], up, sizes=sizes))
         (first, second), _ = read_curves(path)
         order = [0, 1, 2] if up == 2 else [2, 0, 1]
         assert first.shift is None
-        assert second.shift is not None
         at = first.at(np.arange(6.0))[0][:, :3]
         assert np.abs(at - points[:, order]).max() < 1e-6
         at = second.at(np.arange(6.0))[0][:, :3]
@@ -132,8 +99,7 @@ def test_a_bcc_has_open_and_closed_curves_through_its_points(tmp_path: Path) -> 
 
 
 def test_a_bcc_may_hold_polylines(tmp_path: Path) -> None:
-    """Two points are a straight piece. Around the unit circle, the spline is the circle, up to fourth order,
-    so it deviates from n chords by their height 1 - cos(π/n)."""
+    """The spline around a unit circle deviates from n chords by their height 1 - cos(π/n)."""
     t = 2.0 * np.pi * np.arange(32) / 32
     ring = np.column_stack([np.cos(t), np.sin(t), 0.0 * t])
     piece = np.array([[0.0, 1.0, 2.0], [3.0, 5.0, 4.0]])
@@ -144,24 +110,6 @@ def test_a_bcc_may_hold_polylines(tmp_path: Path) -> None:
     at = line.at(np.linspace(0.0, 1.0, 5))[0][:, :3]
     assert np.abs(at - np.linspace(piece[0], piece[1], 5)).max() < 1e-6
     assert deviation == pytest.approx(1.0 - np.cos(np.pi / 32), rel=0.02)
-    # Of a zigzag, the middles of the pieces lie on the spline, other points do not.
-    zigzag = np.column_stack([np.arange(40.0), np.arange(40) % 2, np.zeros(40)])
-    path.write_bytes(bcc([(zigzag, False)], kind=b"PL"))
-    (curve,), deviation = read_curves(path)
-    t = np.arange(0.05, 39.0, 0.1)
-    gap = curve.at(t)[0][:, :2] - zigzag[t.astype(int), :2]
-    away = np.abs(gap[:, 1] - np.where(t % 2 < 1, gap[:, 0], -gap[:, 0])) / np.sqrt(2.0)
-    assert deviation == pytest.approx(away.max(), rel=0.1)
-    assert "more than the radius" in load_material(path).warnings[0]
-
-
-def test_a_bcc_may_hold_numbers_of_eight_bytes(tmp_path: Path) -> None:
-    points = np.random.default_rng(0).random((6, 3))
-    path = tmp_path / "a.bcc"
-    path.write_bytes(bcc([(points, False), (points[:5], True)], sizes=0x88))
-    (first, second), _ = read_curves(path)
-    assert np.abs(first.at(np.arange(6.0))[0][:, :3] - points).max() < 1e-14
-    assert second.shift is not None
 
 
 def test_what_is_too_large_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -181,27 +129,6 @@ def test_text_has_control_points_and_radii(tmp_path: Path) -> None:
     assert (len(first.control), len(second.control)) == (4, 5)
     assert len(load_material(path).curves) == 2
     assert second.control[4].tolist() == [4, 1, 0, 0.2]
-
-
-@pytest.mark.parametrize(
-    ("name", "data", "says"),
-    [
-        ("a.curves", CURVES.replace("2 0 0 .1", "2 0 0"), "line 3"),
-        ("a.curves", CURVES.replace("2 0 0 .1", "2 0 x .1"), "line 3"),
-        ("a.curves", CURVES.replace("2 0 0 .1", "2 0 inf .1"), "finite"),
-        ("a.curves", CURVES.replace("2 0 0 .1", "2 0 0 0"), "radius"),
-        ("a.curves", CURVES.replace(" ", ", "), "line 1"),
-        ("a.curves", CURVES.replace("2 0 0 .1", "2 0 0 1_0"), "line 3"),
-        ("a.curves", CURVES.replace("2 0 0 .1", "2 0 0 .1 " * 4000), "line 3"),
-        ("a.curves", CURVES.replace("3 0 0 .1\n", ""), "fewer than 4"),
-        ("a.curves", "", "no curves"),
-        ("a.bcc", "BCC", "too short"),
-    ],
-)
-def test_damaged_curves_are_refused(tmp_path: Path, name: str, data: str, says: str) -> None:
-    path = tmp_path / name
-    path.write_text(data)
-    assert says in fails(path)
 
 
 SAMPLES = {

@@ -18,17 +18,6 @@ def wavy(n: int = 12, seed: int = 0, shift: np.ndarray = SHIFT) -> Curve:
     return Curve.through(points + np.arange(n)[:, None] / n * shift, 0.01, shift)
 
 
-def test_a_closed_curve_passes_through_its_points_and_repeats_after_its_shift() -> None:
-    rng = np.random.default_rng(1)
-    points = np.column_stack([np.arange(9) / 9, rng.random((9, 2))])
-    curve = Curve.through(points, 0.02, SHIFT)
-    at, _ = curve.at(np.arange(10.0))
-    expected = np.concatenate([points, points[:1] + SHIFT])
-    # The knot between two segments lies on the point of the second of their four control points.
-    assert np.abs(at[:, :3] - expected).max() < 1e-12
-    assert np.abs(at[:, 3] - 0.02).max() < 1e-12
-
-
 def test_positions_and_derivatives_are_those_of_the_b_spline() -> None:
     control = np.random.default_rng(2).random((7, 4))
     spline = BSpline(np.arange(-3.0, 8.0), control, 3)
@@ -78,13 +67,6 @@ def test_frames_close_and_turn_little() -> None:
         assert step[-1] <= 1.5 * step[:-1].max()
 
 
-def test_heights_bound_the_tube() -> None:
-    t = 2.0 * np.pi * np.arange(16) / 16
-    ring = Curve.through(np.column_stack([0.1 * np.cos(t), np.zeros(16), 0.1 * np.sin(t)]), 0.02, np.zeros(3))
-    low, high = Bundle([ring]).heights()
-    assert (low, high) == pytest.approx((-0.12, 0.12), abs=1e-4)
-
-
 @pytest.mark.parametrize("closed", [True, False])
 def test_a_halved_curve_is_the_same(closed: bool) -> None:
     curve = wavy(7) if closed else Curve(np.random.default_rng(4).random((9, 4)))
@@ -92,30 +74,3 @@ def test_a_halved_curve_is_the_same(closed: bool) -> None:
     t = np.linspace(0.0, len(curve.windows()), 100)
     assert len(fine.windows()) == 2 * len(curve.windows())
     assert np.abs(fine.at(2.0 * t)[0] - curve.at(t)[0]).max() < 1e-12
-
-
-def test_a_bundle_holds_the_segments_of_its_curves() -> None:
-    curves = [wavy(7), Curve(np.random.default_rng(4).random((9, 4))), wavy(5, 1)]
-    bundle = Bundle(curves)
-    found = bundle.at(0.3)
-    expected = [curve.at(np.arange(len(curve.windows())) + 0.3) for curve in curves]
-    assert bundle.owner.tolist() == [0] * 7 + [1] * 6 + [2] * 5
-    for k in range(2):
-        assert np.abs(found[k] - np.concatenate([both[k] for both in expected])).max() < 1e-12
-
-
-def test_segments_are_halved_until_they_are_short_for_their_radius() -> None:
-    thin, thick = (Curve.through(wavy(8).at(np.arange(8.0))[0][:, :3], r, SHIFT) for r in (1e-4, 0.1))
-    times = Bundle([thin, thick]).halvings()
-    assert times[1] == 0
-    for _ in range(times[0]):
-        thin = thin.halved()
-    length = np.linalg.norm(thin.at(np.arange(len(thin.windows())) + 0.5)[1][:, :3], axis=1)
-    assert 25e-4 < length.max() < 100e-4
-
-
-def test_a_tube_that_reaches_over_the_border_has_a_copy_on_its_other_side() -> None:
-    points = np.column_stack([np.arange(6) / 6, np.full(6, 0.01), np.zeros(6)])
-    for radius, expected in ((0.005, {0.01}), (0.02, {0.01, 1.01})):
-        runs, _ = Bundle([Curve.through(points, radius, SHIFT)]).copies((1.0, 1.0))
-        assert {round(float(y), 6) for run in runs for y in run[:, 1]} == expected

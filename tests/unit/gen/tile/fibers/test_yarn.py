@@ -104,16 +104,3 @@ def test_every_published_yarn_closes_over_the_tile(name: str) -> None:
     along, around = roughness_of(name)  # type: ignore[arg-type]
     assert 0 < along < 1
     assert 0 < around < 1
-
-
-def test_flyaways_are_as_many_as_the_model_says() -> None:
-    model = YARNS["cotton1"]
-    length = 3.6
-    fibers = fibers_of(straight(), section(model, length), model, np.random.default_rng(5))
-    hairs = [fiber for fiber in fibers if fiber.shift is None]
-    assert len(hairs) == 4 * int(33.77 * length)
-    scale = section(model, length).width / model.radius
-    reach = [np.hypot(*(fiber.control[:, 1:3] - (0.5, 0.0)).T).max() / scale for fiber in hairs]
-    assert np.mean(np.array(reach) > model.radius) > 0.1
-    none = replace(model, hairs=0.0, loops=0.0)
-    assert len(fibers_of(straight(), section(model, length), none, np.random.default_rng(5))) == 300

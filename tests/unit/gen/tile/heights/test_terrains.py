@@ -34,14 +34,9 @@ def terrain(path: Path, heights: Any, *tags: tuple[int, int, Any]) -> Path:
     ("dtype", "nodata", "tag"),
     [
         ("f4", -9999, None),
-        ("f4", -9999, "-9999"),
         ("f4", -3.4028234663852886e38, "-3.40282346638529e+38"),
-        ("f4", -3.4e38, None),
-        ("f4", 3.4e38, None),
         ("f4", 555, "555"),
         ("i2", -32768, None),
-        ("i2", -32768, "-32768"),
-        ("i4", -(2**31), None),
         ("u2", 0, "0"),
     ],
 )
@@ -60,8 +55,6 @@ def test_missing_data_are_refused(tmp_path: Path, dtype: str, nodata: float, tag
 def test_low_heights_and_unused_declarations_are_data(tmp_path: Path) -> None:
     deep = np.linspace(-9999, 4000, 32 * 48).reshape(32, 48)
     assert load_material(terrain(tmp_path / "sea.tif", deep.astype("i2"))).height.min() == -9999
-    path = terrain(tmp_path / "full.tif", hills().astype("f4"), (42113, 2, "-9999"))
-    assert load_material(path).height == pytest.approx(hills())
     # Codes of 8 bits are never -9999, whatever that would be modulo 256.
     codes = np.full((32, 48), -9999 % 256, np.uint8)
     found = load_material(terrain(tmp_path / "byte.tif", codes, (42113, 2, "-9999")))
@@ -94,11 +87,6 @@ DEGREES = (KEYS, 3, (1, 1, 0, 1, 1024, 0, 1, 2))
         # As codes, the unit is 1/65535.
         ("u2", [(SCALE, 12, (30.0, 30.0, 0.0))], 65535 / (48 * 30)),
         ("i2", [(MATRIX, 12, (3.0, 8.0, 0, 0, -4.0, 6.0, *[0.0] * 10))], 1 / (48 * 5)),
-        (
-            "i2",
-            [(MATRIX, 12, (1 / 3600, 0, 0, 7.0, 0, -1 / 3600, 0, 60.0, *[0.0] * 8)), DEGREES],
-            3600 / (48 * 111320 * math.cos(math.radians(60))),
-        ),
         (
             "i2",
             [(SCALE, 12, (1 / 3600, 1 / 3600, 0.0)), (TIE, 12, (0, 0, 0, 7.0, 60.0, 0)), DEGREES],

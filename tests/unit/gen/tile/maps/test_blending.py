@@ -81,25 +81,6 @@ def test_seams_close(shape: tuple[int, int]) -> None:
     assert not any(broken(s) for s in seams(blend("height", height)))
 
 
-def test_the_middle_and_constants_stay() -> None:
-    height = fractal(96, 64)
-    mask = np.where(fractal(96, 64, seed=3) > 0.5, 1.0, 0.0)
-    maps = {
-        "height": height,
-        "opacity": mask,
-        "roughness": 0.3,
-        "sheen": None,
-        "metallic": np.full((9, 7), 0.3),
-    }
-    out = blend_maps(maps)
-    _, middle = bands(height.shape)
-    assert np.array_equal(out["height"][middle], height[middle])
-    assert out["opacity"][middle] == pytest.approx(mask[middle])
-    assert set(np.unique(out["opacity"])) <= {0.0, 1.0}
-    assert (out["roughness"], out["sheen"]) == (0.3, None)
-    assert out["metallic"] == pytest.approx(0.3)
-
-
 def test_maps_of_all_resolutions_are_shifted_alike() -> None:
     """The same function of uv at two resolutions, one of them odd, stays the same function."""
 

@@ -13,7 +13,7 @@ from support.paths import ROOT
 from mbtf_core.images.read import gray, read_image
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.loading import load_material
-from mbtf_gen.tile.maps.normal_map import SYMMETRIES, NormalFit, fit_normals, stored_xy
+from mbtf_gen.tile.maps.normal_map import SYMMETRIES, fit_normals
 
 # What undoes each symmetry.
 UNDO = {
@@ -30,17 +30,11 @@ def height_map(kind: str) -> Floats:
     return np.asarray(gray(read_image(ASSET))[0], np.float64)
 
 
-def fit(height: Floats, normal: Floats) -> NormalFit:
-    found = fit_normals(height, normal)
-    assert found is not None
-    return found
-
-
 @pytest.mark.parametrize("kind", ["fractal", "asset"])
 @pytest.mark.parametrize("green", [1, -1])
 def test_convention_and_scale(kind: str, green: int) -> None:
     height = height_map(kind)
-    found = fit(height, normals_of(height, 0.07) * [1, green, 1])
+    found = fit_normals(height, normals_of(height, 0.07) * [1, green, 1])
     assert found.fits
     assert not found.misfit
     assert found.convention == ("gl" if green == 1 else "dx")
@@ -56,37 +50,13 @@ def test_convention_and_scale(kind: str, green: int) -> None:
 def test_turned_heights(kind: str, turn: str, green: int) -> None:
     height = height_map(kind)
     moved = SYMMETRIES[turn](height)
-    found = fit(moved, normals_of(height, 0.05) * [1, green, 1])
+    found = fit_normals(moved, normals_of(height, 0.05) * [1, green, 1])
     assert found.misfit
     assert not found.fits
     assert found.convention is None
     assert (found.image, found.turn) == ("height", UNDO[turn])
     assert found.best > 0.99
     assert found.best - found.as_is > 0.1
-
-
-@pytest.mark.parametrize("turn", [t for t in SYMMETRIES if "mirrored top" not in t])
-def test_turned_pixels_of_the_normal_map(turn: str) -> None:
-    """Turned as an image, vectors and all left as they were."""
-    height = fractal(96, 96)
-    found = fit(height, np.ascontiguousarray(SYMMETRIES[turn](normals_of(height, 0.05))))
-    assert found.misfit
-    assert (found.image, found.turn) == ("normal", UNDO[turn])
-
-
-def test_heights_upside_down() -> None:
-    height = fractal(64, 128)
-    found = fit(1 - height, normals_of(height, 0.05))
-    assert found.misfit
-    assert found.turn == ""
-
-
-def test_other_resolutions() -> None:
-    height = fractal(128, 128, 3.0)
-    found = fit(height, normals_of(fractal(128, 128, 3.0), 0.05).reshape(64, 2, 64, 2, 3).mean(axis=(1, 3)))
-    assert found.fits
-    assert found.convention == "gl"
-    assert found.scale == pytest.approx(0.05, rel=0.05)
 
 
 class TestNoFinding:
@@ -101,7 +71,7 @@ class TestNoFinding:
         """Unrelated noise never counts as a fit or a misfit."""
         for seed in range(20):
             a, b = (fractal(size, size, 0.0, 100 * seed + k) for k in range(2))
-            found = fit(a, normals_of(b, 0.1))
+            found = fit_normals(a, normals_of(b, 0.1))
             assert not found.fits
             assert not found.misfit
             assert found.convention is None
@@ -109,7 +79,7 @@ class TestNoFinding:
     def test_ridges_have_no_convention(self) -> None:
         """Slopes along u only: the green channel is empty."""
         ridges = np.tile(fractal(64, 64)[:1], (64, 1))
-        found = fit(ridges, normals_of(ridges, 0.05))
+        found = fit_normals(ridges, normals_of(ridges, 0.05))
         assert found.fits
         assert found.convention is None
 
@@ -118,7 +88,7 @@ class TestNoFinding:
         for size in range(24, 48):
             x = (np.arange(size) + 0.5) / size * 2 * np.pi
             waves = np.cos(x)[:, None] + np.cos(x) + 0.3 * np.cos(3 * x)[:, None] * np.cos(3 * x)
-            found = fit(waves, normals_of(waves, 0.05))
+            found = fit_normals(waves, normals_of(waves, 0.05))
             assert found.fits
             assert found.turn == ""
 
@@ -145,11 +115,9 @@ class TestMaterial:
         folder = self.folder(tmp_path, np.rot90(fractal(96, 96), -1), "normal.png", dx=False)
         (warning,) = load_material(folder).warnings
         assert "height.png: fits normal.png only when turned by 90 degrees counter-clockwise" in warning
-        assert "correlation of their slopes 1.00, against" in warning
         save_heights(folder / "height.png", 1 - fractal(96, 96))
         (warning,) = load_material(folder).warnings
         assert "upside down" in warning
-        assert "negative --height-scale" in warning
 
 
 class TestTwoChannels:
@@ -172,7 +140,6 @@ class TestTwoChannels:
         assert "√(1 - x² - y²)" in warning
         expected = normals_of(fractal(64, 64), self.SCALE)
         assert np.abs(material.maps["normal"] - expected).max() < 0.02
-        assert material.normal_fit is not None
         assert material.normal_fit.scale == pytest.approx(self.SCALE, rel=0.01)
 
     @pytest.mark.parametrize("kind", ["blue 0", "blue 255", "height in blue", "x in alpha", "gray and alpha"])
@@ -188,11 +155,6 @@ class TestTwoChannels:
         }
         self.check(self.material(tmp_path, np.dstack(channels[kind])))
 
-    def test_two_channels_of_floats(self, tmp_path: Path) -> None:
-        save_heights(tmp_path / "height.png", fractal(64, 64))
-        np.save(tmp_path / "normal.npy", normals_of(fractal(64, 64), self.SCALE)[..., :2])
-        self.check(load_material(tmp_path))
-
     def test_jpg(self, tmp_path: Path) -> None:
         """Its rounding of a whole map is not taken for a missing z."""
         from PIL import Image as Pillow
@@ -202,13 +164,3 @@ class TestTwoChannels:
             codes = np.rint((normals_of(fractal(64, 64), scale) + 1) * 127.5).astype(np.uint8)
             Pillow.fromarray(codes).save(tmp_path / "normal.jpg", quality=quality)
             assert not any("√" in warning for warning in load_material(tmp_path).warnings)
-
-    def test_whole_maps_are_read_as_they_are(self, tmp_path: Path) -> None:
-        """A height in alpha is mentioned; a groove, whose blue is constant, stores its z."""
-        codes = self.stored()
-        height = np.rint(255 * fractal(64, 64)).astype(np.uint8)
-        (warning,) = self.material(tmp_path, np.dstack([codes, height])).warnings
-        assert "alpha channel" in warning
-        x = np.where(np.arange(64) % 16 < 8, 0.6, -0.6) * np.ones((64, 1))
-        groove = np.stack([x, np.zeros_like(x), np.full_like(x, 0.8)], axis=-1)
-        assert stored_xy(np.rint((groove + 1) * 127.5) / 127.5 - 1) is None
