@@ -9,7 +9,7 @@ point (x, y) of the tiles lies at ``p + s z n``, z ≤ 0. N tiles around, with `
 - torus: outer radius R; a tube of M ≈ N/2 tiles around, whose ratio of radii is r/R₀ = k/√(1+k²), k = M a/N.
 
 The axis of a shape is z. A picture shows radiance in 1/sr under a distant light of irradiance 1 across its
-rays, and no background.
+rays, and no background. Opacity and normal maps are left out.
 """
 
 from __future__ import annotations
