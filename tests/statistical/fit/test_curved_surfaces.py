@@ -82,7 +82,7 @@ def test_a_curved_shape_looks_like_displaced_geometry(shape: str, bumps: tuple[J
     assert outline_distance(found, expected) < 0.5
     assert outline_distance(smooth, expected) > 1.0
     mean = expected.value.mean()
-    # On a plane, the known surface alone is 2% too bright.
+    # The material has the known surface alone, nothing that is learned of its light.
     assert found.value.mean() == pytest.approx(mean, rel=0.04)
     errors = [np.sqrt(((blocks(x) - blocks(expected)) ** 2).mean()) / mean for x in (found, smooth)]
     assert errors[0] < min(0.085, 0.7 * errors[1])
