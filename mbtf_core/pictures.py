@@ -284,6 +284,8 @@ def read_references(folder: Path) -> list[tuple[NDArray[np.float32], Camera, NDA
         hint = suggest_path(folder, Path.is_dir)
         raise InputError("holds no pictures of mbtf-gen reference", where=folder, hint=hint)
     options = known["depends"]["reference"]
+    if options.get("surface", "plane") != "plane":
+        raise InputError(f"shows a {options['surface']}, not the plane", where=folder)
     out = []
     for across in options["tiles_across"]:
         name = next((n for n in known["items"] if n.endswith(f"-tiles{across:g}")), None)

@@ -84,7 +84,7 @@ class TurntableSection(Settings):
         None,
         ge=1,
         le=1000,
-        description="tiles around the ball's equator; default: 3 to 8, so that a texel covers about 2 pixels",
+        description="tiles around the equator; default: 3 to 8, so that a texel covers about 2 pixels",
     )
 
     def tiles_around(self, resolution: int) -> int:

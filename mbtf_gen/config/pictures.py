@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
@@ -32,6 +32,7 @@ class Direction(Settings):
         return {"elevation": elevation, "azimuth": azimuth}
 
 
+Shape = Literal["plane", "sphere", "cylinder", "torus"]
 Size = Annotated[int, Field(ge=8, le=16384)]
 TilesAcross = Annotated[
     list[Annotated[float, Field(gt=0, le=1e4)]],
@@ -77,6 +78,18 @@ class ReferenceSection(ViewSection):
     kind: Annotated[Literal["query", "pixel", "both"], Flag("--kind")] = Field(
         "both", description="values: M at each pixel's footprint (query), or the filtered image (pixel)"
     )
+    surface: Annotated[Shape, Flag("--surface")] = Field(
+        "plane", description="what the material covers; others than the plane show the filtered image"
+    )
+    tiles: Annotated[Annotated[int, Field(ge=3, le=1000)], Flag("--tiles-around")] = Field(
+        13, description="tiles around the equator"
+    )
+
+    @model_validator(mode="after")
+    def _check_kind(self) -> Self:
+        if self.surface != "plane" and self.kind == "query":
+            raise ValueError(f"a {self.surface} has no pictures of the kind query")
+        return self
 
 
 class PreviewSection(Settings):

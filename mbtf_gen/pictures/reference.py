@@ -40,9 +40,10 @@ from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.run.task import Item
 from mbtf_core.stats import pooled_relative_error
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.config.pictures import ReferenceConfig, ViewSection
+from mbtf_gen.config.pictures import ReferenceConfig, ReferenceSection, Shape, ViewSection
 from mbtf_gen.forecast import announce
 from mbtf_gen.job import Job
+from mbtf_gen.pictures.shapes import render_shape
 from mbtf_gen.planning.run_plan import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 
@@ -186,8 +187,15 @@ def cameras_of(view: ViewSection) -> list[Camera]:
 
 def picture_names(view: ViewSection, kinds: Sequence[PixelKind]) -> dict[tuple[Camera, PixelKind], str]:
     """Names of pictures, without suffix."""
-    pairs = product(cameras_of(view), kinds)
-    return {(camera, kind): f"{kind}-tiles{camera.tiles_across:g}" for camera, kind in pairs}
+    pairs, shape = product(cameras_of(view), kinds), _shape_of(view)
+    return {
+        (camera, kind): f"{kind if shape == 'plane' else shape}-tiles{camera.tiles_across:g}"
+        for camera, kind in pairs
+    }
+
+
+def _shape_of(view: ViewSection) -> Shape:
+    return view.surface if isinstance(view, ReferenceSection) else "plane"
 
 
 def check_view(job: Job, view: ViewSection, output: Path, kinds: int) -> None:
@@ -197,7 +205,8 @@ def check_view(job: Job, view: ViewSection, output: Path, kinds: int) -> None:
         len(view.tiles_across) * kinds * _picture_bytes(job, view),
         "reduce --size, or choose another folder with -o",
     )
-    cameras_of(view)[0].queries(from_angles(90, 0))
+    if _shape_of(view) == "plane":
+        cameras_of(view)[0].queries(from_angles(90, 0))
 
 
 def note_fine_pixels(cameras: Sequence[Camera], lattice: Lattice, console: Console) -> None:
@@ -237,24 +246,26 @@ def render_missing(
     cameras = cameras_of(view)
     missing = {key: name for key, name in names.items() if folder.finished(name) is None}
     advance(len(names) - len(missing))
+    curved = view if isinstance(view, ReferenceSection) and view.surface != "plane" else None
     items = [
         Item(
             name,
             {
-                **{"source": job, "camera": camera, "omega_i": omega_i, "kind": kind},
+                **{"source": job, "camera": camera, "omega_i": omega_i},
+                **({"shape": curved.surface, "around": curved.tiles} if curved else {"kind": kind}),
                 **{"spp": view.spp, "seed": job.config.seed, "index": cameras.index(camera)},
             },
         )
         for (camera, kind), name in missing.items()
     ]
     with open_runner(cluster if missing else None, console.note) as runner:
-        if runner.here and missing:
+        if runner.here and missing and curved is None:
             paths, estimator = len(missing) * view.size**2 * view.spp, picture_estimator(job)
             seconds = partial(picture_seconds, estimator, cameras[0], omega_i, paths)
             size, fibers = len(missing) * _picture_bytes(job, view), job.material.scatters
             faster = f"--size {max(1, view.size // 2)}, --spp {max(2, view.spp // 4 * 2)}"
             announce(console, paths, seconds, size, fibers, faster)
-        for done in runner.map(render_reference, items):
+        for done in runner.map(render_shape if curved else render_reference, items):
             if done.error:
                 hint = "the same command renders the missing pictures"
                 raise PartialError(f"picture {done.name} failed: {done.error}", hint=hint)
@@ -294,6 +305,8 @@ def render_references(
     wanted, job = config.reference, Job.load(config)
     job.announce_briefly()
     kinds: tuple[PixelKind, ...] = ("query", "pixel") if wanted.kind == "both" else (wanted.kind,)
+    if wanted.surface != "plane":
+        kinds = ("pixel",)
     names = picture_names(wanted, kinds)
     check_view(job, wanted, output, len(kinds))
     note_fine_pixels(cameras_of(wanted), job.lattice, console)

@@ -38,6 +38,7 @@ def write_material(
     transmittance: Transmittance | None = None,
     glossy: bool = True,
     coated: bool = False,
+    known: KnownSurface | None = None,
     **data: Any,
 ) -> Material:
     """Write a material of random weights that all matter, and return it as read back.
@@ -51,6 +52,7 @@ def write_material(
     brightness : mean of all biases
     transmittance : None for an opaque material
     glossy, coated : whether the known surface of `relief` has a glossy lobe, and a clear coat
+    known : another known surface
     data : what material.json states of the data set
     """
     config = FitConfig.model_validate({"model": model, "network": network or {}})
@@ -60,7 +62,7 @@ def write_material(
     built.initialize(torch.Generator().manual_seed(seed), 0.2)
     if built.tracing is not None:
         rough = rough_surface(lattice, glossy=glossy, coated=coated)
-        built.know(rough if constant is None else flat(lattice, constant))
+        built.know(known or (rough if constant is None else flat(lattice, constant)))
     tensors = built.weights()
     for name, tensor in tensors.items():
         if "texture" in name or "pyramid" in name:

@@ -20,6 +20,7 @@ from mbtf_fit.backends.mitsuba.textures import Textures
 from mbtf_fit.ops import Backend, Operation
 from mbtf_fit.ops.operation import input_sizes
 from mbtf_gen.engine.types import Float
+from mbtf_gen.tile.tracers.heightfield import HeightField
 
 Arithmetic = Literal["unrolled", "cooperative", "half"]
 Numbers = list[Float]
@@ -38,13 +39,14 @@ class Loader:
     stored : the material
     arithmetic : of networks
     sizes : of all values
-    textures : those that have been read, by name
+    textures, heightfields : those that have been read, by name
     """
 
     stored: StoredMaterial
     arithmetic: Arithmetic
     sizes: Mapping[str, int]
     textures: dict[str, Textures] = field(default_factory=dict)
+    heightfields: dict[str, HeightField] = field(default_factory=dict)
 
     @property
     def lattice(self) -> Lattice:

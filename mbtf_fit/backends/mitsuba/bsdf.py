@@ -7,7 +7,7 @@ over the footprint and over the light kernel of the data. ``eval`` therefore ret
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,9 +18,12 @@ import numpy as np
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.pictures import pixel_sigma
 from mbtf_fit.backends.mitsuba.backend import Arithmetic
+from mbtf_fit.backends.mitsuba.curvature import curvature, rotated, with_normal_partials
 from mbtf_fit.backends.mitsuba.evaluator import Evaluator
 from mbtf_fit.backends.mitsuba.lobes import LobeTextures, Mixture, fit_lobes
 from mbtf_fit.backends.mitsuba.names import BSDF_NAME, footprints_provided, refuse_unknown
+from mbtf_fit.backends.mitsuba.shade import DirectLight
+from mbtf_fit.backends.mitsuba.shell import ShellHit, clamped, tilted
 from mbtf_fit.backends.mitsuba.stored_material import StoredMaterial, read_material
 from mbtf_fit.material.format import QUERY
 from mbtf_fit.ops import Trace
@@ -34,6 +37,7 @@ from mbtf_gen.engine.types import (
     Properties,
     Scene,
     SurfaceInteraction3f,
+    Vector2f,
     Vector3f,
 )
 
@@ -43,7 +47,7 @@ TOLERANCE = {"unrolled": 1e-4, "cooperative": 1e-4, "half": 1e-2}
 # One conformance query of so many may deviate where view rays are traced.
 MISSED_EDGES = 100
 
-PARAMETERS = ("material", "uv_scale", "sigma", "networks", "sampling")
+PARAMETERS = ("material", "uv_scale", "sigma", "networks", "sampling", "silhouettes")
 
 _log = logging.getLogger(__name__)
 # Materials with a warning of missing footprints.
@@ -53,11 +57,12 @@ _warned: set[Path] = set()
 @dataclass(frozen=True)
 class Frame:
     """The tile's frame at hits: the shading frame, rotated about the normal by an angle of cosine c and sine
-    s, and reflected where hand is -1."""
+    s, and reflected where hand is -1; then tilted, over a curved surface."""
 
     c: Float
     s: Float
     hand: Float
+    tilt: Vector2f | None = None
 
     @classmethod
     def at(cls, si: SurfaceInteraction3f) -> Frame:
@@ -70,22 +75,17 @@ class Frame:
 
     def to_tile(self, w: Vector3f) -> Vector3f:
         """Local direction → the tile's."""
-        return mi.Vector3f(
+        w = mi.Vector3f(
             dr.fma(self.c, w.x, self.s * w.y), self.hand * dr.fma(self.c, w.y, -self.s * w.x), w.z
         )
+        return w if self.tilt is None else tilted(w, self.tilt)
 
     def to_local(self, w: Vector3f) -> Vector3f:
         """Inverse of :meth:`to_tile`."""
+        if self.tilt is not None:
+            w = tilted(w, self.tilt, back=True)
         y = self.hand * w.y
         return mi.Vector3f(dr.fma(self.c, w.x, -self.s * y), dr.fma(self.s, w.x, self.c * y), w.z)
-
-
-def clamped(w: Vector3f, min_cos: Float) -> Vector3f:
-    """Directions, raised to the lowest ones with data."""
-    sine, largest = dr.sqrt(dr.fma(w.x, w.x, w.y * w.y)), dr.sqrt(1.0 - min_cos * min_cos)
-    low = sine > largest
-    scale = dr.select(low, largest / sine, 1.0)
-    return mi.Vector3f(w.x * scale, w.y * scale, dr.select(low, min_cos, w.z))
 
 
 class MbtfBSDF(mi.BSDF):
@@ -99,6 +99,8 @@ class MbtfBSDF(mi.BSDF):
     sigma : footprint in tile widths where the integrator provides none; default: that of the finest level
     networks : ``unrolled``, ``cooperative`` or ``half``; the default depends on variant and size
     sampling : ``lobes`` (default) or ``cosine``
+    silhouettes : whether heights are traced over the curved surface, which is their top, and rays that miss
+        them pass through the shape (default false)
 
     Raises
     ------
@@ -123,6 +125,17 @@ class MbtfBSDF(mi.BSDF):
         if self._choice(props, "sampling", ("lobes", "cosine")) != "cosine":
             # Cooperative kernels do not depend on the material: they are compiled once.
             self.lobes = LobeTextures(fit_lobes(Evaluator(stored, "cooperative")))
+        silhouettes = props.get("silhouettes", False)
+        if not isinstance(silhouettes, bool):
+            what = f"silhouettes must be true or false, not {silhouettes}"
+            raise UsageError(what, where=self._name(props))
+        self.shell = self.evaluator.shell if silhouettes else None
+        if silhouettes and self.shell is None:
+            raise UsageError(
+                "has silhouettes, but its material knows no heights",
+                where=self._name(props),
+                hint="fit the model relief, or leave silhouettes out",
+            )
         self.uv_scale = self._pair(props, "uv_scale")
         self.sigma_given = "sigma" in props
         self.sigma = self._positive(props, "sigma", stored.lattice.sigma_range[0])
@@ -131,7 +144,7 @@ class MbtfBSDF(mi.BSDF):
         known = mi.BSDFFlags
         self.m_flags = known.GlossyReflection | known.FrontSide | known.SpatiallyVarying | known.Anisotropic
         self.m_components = [self.m_flags]
-        self.transmits = stored.transmittance is not None
+        self.transmits = self.shell is not None or stored.transmittance is not None
         if self.transmits:
             through = known.Null | known.FrontSide | known.BackSide | known.SpatiallyVarying
             self.m_components = [self.m_flags, through]
@@ -190,8 +203,18 @@ class MbtfBSDF(mi.BSDF):
 
     def _view(self, si: SurfaceInteraction3f) -> View:
         self._warn_once()
-        frame = Frame.at(si)
-        return View(self, frame, self.uv(si), self.evaluator.level(self.footprint(si)), frame.to_tile(si.wi))
+        frame, u, level = Frame.at(si), self.uv(si), self.evaluator.level(self.footprint(si))
+        wi = frame.to_tile(si.wi)
+        if self.shell is None:
+            return View(self, frame, u, level, wi, wi.z > 0)
+        # The project's integrator gives them with the footprint.
+        bent = si if footprints_provided.get() else with_normal_partials(si)
+        form = rotated(curvature(bent, self.uv_scale.x * self.uv_scale.y), frame.c, frame.s, frame.hand)
+        hit = self.shell.meet(u, level, wi, form, self.min_cos)
+        frame = replace(frame, tilt=hit.tilt)
+        # Rays leave a mesh through its back, where shading normals of coarse ones may face them.
+        front = dr.dot(si.n, si.to_world(si.wi)) > 0
+        return View(self, frame, hit.u, level, hit.omega_o, front & (wi.z > 0), hit)
 
     def sample(
         self,
@@ -209,7 +232,7 @@ class MbtfBSDF(mi.BSDF):
         reused = dr.clip((sample1 - through) / dr.maximum(1.0 - through, 1e-6), 0.0, 1.0)
         mixture = view.mixture()
         wo = mixture.sample(reused, sample2)
-        good = active & ~transmitted & view.reflects(ctx) & (view.wi.z > 0) & (wo.z > 0)
+        good = active & ~transmitted & view.reflects(ctx) & view.front & (wo.z > 0)
         wo = dr.select(good, wo, mi.Vector3f(0, 0, 1))
         value, pdf = view.value(ctx, wo), mixture.density(wo) * (1.0 - through)
         good &= pdf > 0
@@ -227,8 +250,8 @@ class MbtfBSDF(mi.BSDF):
     ) -> tuple[Color3f, Float]:
         """(f·cos, density) of a local direction."""
         view = self._view(si)
-        good = active & view.reflects(ctx) & (view.wi.z > 0) & (wo.z > 0)
         to_light = view.frame.to_tile(wo)
+        good = active & view.reflects(ctx) & view.front & view.above(to_light)
         pdf = view.mixture().density(to_light) * (1.0 - view.transmission_probability(ctx))
         return dr.select(good, view.value(ctx, to_light), 0.0), dr.select(good, pdf, 0.0)
 
@@ -259,17 +282,32 @@ class MbtfBSDF(mi.BSDF):
 
 @dataclass(frozen=True)
 class View:
-    """A material at hits: position, level and view direction wi; directions are in the tile's frame."""
+    """A material at hits: position, level and view direction wi; directions are in the tile's frame.
+
+    Of a curved surface `hit` says where view rays meet the heights. `front` are hits that face the viewer.
+    """
 
     bsdf: MbtfBSDF
     frame: Frame
     u: Point2f
     level: Float
     wi: Vector3f
+    front: Mask
+    hit: ShellHit | None = None
 
     def transmittance(self) -> Float:
         """Transparent fraction of the footprint."""
-        return self.bsdf.evaluator.transmittance(self.u, self.level, self.wi)
+        found = self.bsdf.evaluator.transmittance(self.u, self.level, self.wi)
+        if self.hit is None:
+            return found
+        # Rays pass the back of a shape where they leave its shell, not its inside.
+        return dr.select(
+            self.front, 1.0 - self.hit.share * (1.0 - found), dr.select(self.hit.leaves, 1.0, 0.0)
+        )
+
+    def above(self, wo: Vector3f) -> Mask:
+        """Whether light may come from a direction: from above, or from anywhere around a curved surface."""
+        return wo.z > 0 if self.hit is None else (wo.z > 0) | ~self.hit.flat
 
     def reflects(self, ctx: BSDFContext) -> bool:
         """Whether the context enables reflection."""
@@ -291,8 +329,17 @@ class View:
         viewer, light = (clamped(w, self.bsdf.min_cos) for w in (self.wi, wo))
         if ctx.mode == mi.TransportMode.Importance:
             viewer, light = light, viewer
-        values = self.bsdf.evaluator.stage1(self.u, self.level, viewer)
-        return self.bsdf.evaluator.value(values, light) * dr.maximum(wo.z, 0.0)
+        evaluator, hit = self.bsdf.evaluator, self.hit
+        if hit is None or ctx.mode == mi.TransportMode.Importance:
+            values = evaluator.stage1(self.u, self.level, viewer)
+            return evaluator.value(values, light) * dr.maximum(wo.z, 0.0)
+        values = evaluator.stage1(self.u, self.level, viewer, hit.values)
+        least = self.bsdf.min_cos
+        visible = hit.visibility(wo)
+        lit = DirectLight(visible, wo, dr.maximum(wo.z, least), least, hit.flat)
+        cosine = hit.light_cosine(wo, least, visible)
+        cosine = dr.select(hit.flat, dr.maximum(wo.z, 0.0), cosine)
+        return evaluator.value(values, light, lit) * cosine * hit.share
 
 
 def _check_conformance(evaluator: Evaluator, stored: StoredMaterial) -> None:

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbtf_core.errors import InputError
-from mbtf_fit.backends.mitsuba import lookup, network, shade  # noqa: F401
+from mbtf_fit.backends.mitsuba import lookup, network, shade
 from mbtf_fit.backends.mitsuba.backend import MITSUBA, Arithmetic, Loader, Numbers, Step
 from mbtf_fit.backends.mitsuba.stored_material import F32, StoredMaterial
 from mbtf_fit.backends.mitsuba.textures import Textures
 from mbtf_fit.material.format import DESCRIPTION_NAME
-from mbtf_fit.ops import Operation, sizes_of, stages
+from mbtf_fit.ops import Operation, Shade, Trace, sizes_of, stages
 from mbtf_fit.ops.operation import output_names
 from mbtf_gen.engine.types import Color3f, Float, Point2f, Vector3f
 
@@ -34,6 +34,7 @@ class Evaluator:
     Attributes
     ----------
     textures : those of the material by the names of their tensors; users may change their texels
+    shell : the heights that view rays are traced to; None for a material that has none
 
     Raises
     ------
@@ -53,6 +54,8 @@ class Evaluator:
         self.arithmetic = network.default_arithmetic(stored) if arithmetic is None else arithmetic
         loader = Loader(stored, self.arithmetic, sizes_of(stored.operations))
         self.textures = loader.textures
+        trace = next((op for op in stored.operations if isinstance(op, Trace)), None)
+        self.shell = None if trace is None else lookup.shell_of(trace, loader)
         first, second = ([(op, MITSUBA[op](op, loader)) for op in part] for part in stages(stored.operations))
         self._first, self._second, self._last = first, second, stored.operations[-1].output
         self._coefficients = None if stored.transmittance is None else Textures(stored.transmittance)
@@ -61,17 +64,19 @@ class Evaluator:
         """Fractional level of footprints in tile widths."""
         return dr.clip(-dr.log2(2.0 * sigma), 0.0, float(self.lattice.finest))
 
-    def stage1(self, u: Point2f, level: Float, omega_o: Vector3f) -> Values:
-        """Values that do not depend on the light, at uv positions for unit view vectors."""
-        return _run(self._first, {"u": list(u), "level": [level], "omega_o": list(omega_o)})
+    def stage1(self, u: Point2f, level: Float, omega_o: Vector3f, given: Values | None = None) -> Values:
+        """Values that do not depend on the light, at uv positions for unit view vectors. Those `given` are
+        not computed."""
+        values = {"u": list(u), "level": [level], "omega_o": list(omega_o), **(given or {})}
+        return _run([step for step in self._first if step[0].output not in values], values)
 
-    def stage2(self, values: Values, omega_i: Vector3f) -> Values:
-        """All values, from those of stage 1 and unit vectors towards the light."""
-        return _run(self._second, {**values, "omega_i": list(omega_i)})
+    def stage2(self, values: Values, omega_i: Vector3f, lit: shade.DirectLight | None = None) -> Values:
+        """All values, from those of stage 1 and unit vectors towards the light, `lit` on curved surfaces."""
+        return _run(self._second, {**values, "omega_i": list(omega_i)}, lit)
 
-    def value(self, values: Values, omega_i: Vector3f) -> Color3f:
+    def value(self, values: Values, omega_i: Vector3f, lit: shade.DirectLight | None = None) -> Color3f:
         """The value in 1/sr, at least 0, of values of stage 1."""
-        return dr.maximum(mi.Color3f(*self.stage2(values, omega_i)[self._last]), 0.0)
+        return dr.maximum(mi.Color3f(*self.stage2(values, omega_i, lit)[self._last]), 0.0)
 
     def transmittance(self, u: Point2f, level: Float, omega_o: Vector3f) -> Float:
         """Transparent fraction of the footprint for unit vectors on either side of the plane, equal for
@@ -107,9 +112,12 @@ class Evaluator:
         return out
 
 
-def _run(steps: Sequence[tuple[Operation, Step]], values: Values) -> Values:
+def _run(
+    steps: Sequence[tuple[Operation, Step]], values: Values, lit: shade.DirectLight | None = None
+) -> Values:
     """`values`, and those that the steps of operations compute."""
     for op, step in steps:
-        found = step(*op.arguments(lambda name, part: values[name][part]))
+        given = {"lit": lit} if isinstance(op, Shade) else {}
+        found = step(*op.arguments(lambda name, part: values[name][part]), **given)
         values.update(zip(output_names(op), found if isinstance(found, tuple) else (found,), strict=True))
     return values

@@ -21,6 +21,7 @@ import mitsuba as mi
 from mbtf_core.errors import UsageError
 from mbtf_core.pictures import PIXEL_SIGMA
 from mbtf_fit.backends.mitsuba.bsdf import MbtfBSDF, check_scene
+from mbtf_fit.backends.mitsuba.curvature import with_normal_partials
 from mbtf_fit.backends.mitsuba.names import INTEGRATOR_NAME, footprints_provided, refuse_unknown
 from mbtf_fit.ops.constants import MAX_ANISOTROPY
 from mbtf_gen.engine.types import (
@@ -117,6 +118,13 @@ def may_transmit(scene: Scene) -> bool:
     return any(bsdf is None or mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in surfaces)
 
 
+def may_curve(scene: Scene) -> bool:
+    """Whether a surface of the scene may trace heights over its curvature; True if unknown."""
+    others = [b for b in (s.bsdf() for s in scene.shapes()) if not isinstance(b, MbtfBSDF)]
+    unknown = any(b is None or mi.has_flag(b.flags(), mi.BSDFFlags.Null) for b in others)
+    return unknown or any(material.shell is not None for material in materials_of(scene))
+
+
 class ConePath(mi.SamplingIntegrator):
     """Path tracing with emitter sampling and multiple importance sampling, with ray cones.
 
@@ -162,7 +170,8 @@ class ConePath(mi.SamplingIntegrator):
         try:
             cone = (mi.Ray3f(ray), width, spread)
             materials = [] if self.round else materials_of(scene)
-            return *self._trace(scene, sampler, *cone, mi.Bool(active), may_transmit(scene), materials), []
+            known = (may_transmit(scene), may_curve(scene), materials)
+            return *self._trace(scene, sampler, *cone, mi.Bool(active), *known), []
         finally:
             footprints_provided.reset(token)
 
@@ -176,6 +185,7 @@ class ConePath(mi.SamplingIntegrator):
         spread: Float,
         active: Mask,
         transmits: bool,
+        curved: bool,
         materials: list[Any],
     ) -> tuple[Spectrum, Mask]:
         radiance, throughput = mi.Spectrum(0.0), mi.Spectrum(1.0)
@@ -195,10 +205,13 @@ class ConePath(mi.SamplingIntegrator):
             other = scene.pdf_emitter_direction(last, ds, seen & ~specular)
             weight = dr.select(specular, 1.0, pdf / (pdf + other))
             radiance[seen] += throughput * weight * emitter.eval(si, seen)
-            valid |= (depth == 0) & si.is_valid()
-            active &= si.is_valid() & (depth + 1 < most)
+            active &= si.is_valid()
+            valid |= active & (most == 1)
+            active &= depth + 1 < most
             # Light from a sampled emitter.
             si = write_footprint(si, ray, width)
+            if dr.hint(curved, mode="scalar"):
+                si = with_normal_partials(si, active)
             bsdf = si.bsdf()
             if dr.hint(bool(materials), mode="scalar"):
                 filtered = mi.Bool(False)
@@ -209,7 +222,7 @@ class ConePath(mi.SamplingIntegrator):
             ds, light = scene.sample_emitter_direction(si, sampler.next_2d(active), not transmits, smooth)
             smooth &= ds.pdf > 0
             if dr.hint(transmits, mode="scalar"):
-                light *= self._transmitted(scene, si, ds, width, smooth)
+                light *= self._transmitted(scene, si, ds, width, smooth, curved)
             wo = si.to_local(ds.d)
             value, density = bsdf.eval_pdf(context, si, wo, smooth)
             weight = dr.select(ds.delta, 1.0, ds.pdf / (ds.pdf + density))
@@ -220,6 +233,7 @@ class ConePath(mi.SamplingIntegrator):
             eta *= bs.eta
             delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
             through = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null)
+            valid |= active & ~through
             last = dr.select(active & ~through, mi.Interaction3f(si), last)
             pdf = dr.select(through, pdf, bs.pdf)
             specular = dr.select(through, specular, delta)
@@ -239,7 +253,13 @@ class ConePath(mi.SamplingIntegrator):
 
     @dr.syntax
     def _transmitted(
-        self, scene: Scene, si: SurfaceInteraction3f, ds: DirectionSample3f, width: Float, active: Mask
+        self,
+        scene: Scene,
+        si: SurfaceInteraction3f,
+        ds: DirectionSample3f,
+        width: Float,
+        active: Mask,
+        curved: bool,
     ) -> Spectrum:
         """Transmittance of the surfaces between a hit and an emitter."""
         through, active = mi.Spectrum(1.0), mi.Bool(active)
@@ -251,6 +271,8 @@ class ConePath(mi.SamplingIntegrator):
             passes = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
             # The width at the hit: an approximation that is exact for near surfaces.
             hit = write_footprint(hit, ray, width)
+            if dr.hint(curved, mode="scalar"):
+                hit = with_normal_partials(hit, active)
             through[active] *= dr.select(passes, bsdf.eval_null_transmission(hit, passes), 0.0)
             active &= dr.max(through) > 0.0
             ray = hit.spawn_ray_to(ds.p)

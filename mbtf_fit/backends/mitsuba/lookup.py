@@ -11,10 +11,10 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit import ops
 from mbtf_fit.backends.mitsuba.backend import MITSUBA, Loader, Numbers, Step
+from mbtf_fit.backends.mitsuba.shell import Shell, displaced
 from mbtf_fit.material.format import WEIGHTS_NAME
 from mbtf_gen.engine.types import Float, UInt32
 from mbtf_gen.tile.tracers.heightfield import HeightField
-from mbtf_gen.tile.tracers.heightfield_tracer import closest_height
 
 
 @MITSUBA.implements(ops.Lookup)
@@ -69,35 +69,35 @@ def _offset(op: ops.Offset, loader: Loader) -> Step:
 
 @MITSUBA.implements(ops.Trace)
 def _trace(op: ops.Trace, loader: Loader) -> Step:
-    aspect = loader.lattice.aspect
-    heights = loader.stored.take(op.heights, (None, None, 1))[..., 0]
-    if heights.size == 0 or heights.max() > 0:
-        fault = "is empty" if heights.size == 0 else "has heights above the reference plane"
-        raise InputError(f"its tensor '{op.heights}' {fault}", where=loader.stored.folder / WEIGHTS_NAME)
-    heightfield = HeightField.of(heights.astype(np.float64), aspect, 1.0, two_sided=False)
-
-    def height(u: Numbers, omega_o: Numbers) -> Float:
-        x, y = (c - dr.floor(c) for c in u)
-        ray = mi.Ray3f(mi.Point3f(x - 0.5, (y - 0.5) * aspect, 0.0), -mi.Vector3f(*omega_o))
-        return closest_height(heightfield, ray, op.crossings)
+    shell = shell_of(op, loader)
 
     def step(u: Numbers, level: Numbers, omega_o: Numbers) -> tuple[Numbers, Numbers]:
-        sigma = 0.5 * dr.exp2(-level[0])
-        flat = mi.Vector2f(*omega_o[:2])
-        length = dr.sqrt(dr.fma(flat.x, flat.x, dr.square(flat.y)))
-        along = dr.select(length > 0.0, flat / length, mi.Vector2f(1.0, 0.0))
         total, hits = mi.Float(0.0), []
-        for x, y in op.places:
-            at = [
-                u[0] + sigma * (y * along.x - x * along.y),
-                u[1] + sigma * ((y * along.y + x * along.x) / aspect),
-            ]
-            z = height(at, omega_o)
-            hits += _displaced(at, z, omega_o, aspect)
+        for at in shell.places(u, level[0], omega_o):
+            z = shell.flat_height(at, omega_o)
+            hits += displaced(at, z, omega_o, shell.aspect)
             total += z
         return [total / len(op.places)], hits
 
     return step
+
+
+def shell_of(op: ops.Trace, loader: Loader) -> Shell:
+    """The heights that an operation traces.
+
+    Raises
+    ------
+    InputError : they are none
+    """
+    aspect, known = loader.lattice.aspect, loader.heightfields
+    if op.heights in known:
+        return Shell(op, known[op.heights], aspect)
+    heights = loader.stored.take(op.heights, (None, None, 1))[..., 0]
+    if heights.size == 0 or heights.max() > 0:
+        fault = "is empty" if heights.size == 0 else "has heights above the reference plane"
+        raise InputError(f"its tensor '{op.heights}' {fault}", where=loader.stored.folder / WEIGHTS_NAME)
+    known[op.heights] = HeightField.of(heights.astype(np.float64), aspect, 1.0, two_sided=False)
+    return Shell(op, known[op.heights], aspect)
 
 
 @MITSUBA.implements(ops.Displace)
@@ -112,12 +112,6 @@ def _displace(op: ops.Displace, loader: Loader) -> Step:
             coarse = dr.minimum(mi.UInt32(level[0]), finest - 1)
             pair = (dr.gather(mi.Float, weights, coarse + k) for k in (0, 1))
             weight = dr.lerp(*pair, level[0] - mi.Float(coarse))
-        return _displaced(u, weight * z[0], omega_o, aspect)
+        return displaced(u, weight * z[0], omega_o, aspect)
 
     return step
-
-
-def _displaced(u: Numbers, height: Float, omega_o: Numbers, aspect: float) -> Numbers:
-    """uv of the points at heights on lines through points of the plane."""
-    step = height / omega_o[2]
-    return [dr.fma(step, omega_o[0], u[0]), dr.fma(step / aspect, omega_o[1], u[1])]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -27,7 +28,34 @@ from mbtf_fit.ops.constants import (
     VOIGT_WIDENING,
 )
 from mbtf_fit.ops.shade import adjacent_azimuths, grazing_reflectance
-from mbtf_gen.engine.types import Color3f, Float, Normal3f, Point2f, Vector3f
+from mbtf_gen.engine.types import Color3f, Float, Mask, Normal3f, Point2f, Vector3f
+
+
+@dataclass(frozen=True)
+class DirectLight:
+    """Light on a curved surface, where horizons are not those of the plane.
+
+    Attributes
+    ----------
+    visible : visibility of the light at each place, and what it would be over a plane
+    omega_i : towards the light, also below the plane
+    cosine : positive number of which values are multiples, in place of the light's cosine
+    least : smallest cosine of the data
+    flat : where the light is as on a plane
+    """
+
+    visible: Sequence[tuple[Float, Float]]
+    omega_i: Vector3f
+    cosine: Float
+    least: Float
+    flat: Mask
+
+    def light(self, horizon: Float, place: int) -> Float:
+        """Light at a place by the visibility of horizons, which knows the footprint and of which curvature
+        changes some. Light below that of the data has been traced alone."""
+        curved, plane = self.visible[place]
+        weight = dr.clip(self.omega_i.z / self.least - 1.0, 0.0, 1.0)
+        return dr.lerp(curved, dr.clip(horizon + curved - plane, 0.0, 1.0), weight) / self.cosine
 
 
 @MITSUBA.implements(ops.Shade)
@@ -65,13 +93,27 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         deviations = (elevation - mean) * dr.rsqrt(2.0 * dr.maximum(variance, op.least_variance))
         return dr.fma(0.5, dr.erf(deviations), 0.5)
 
-    def at(hit: Point2f, found: Numbers, level: Float, omega_i: Vector3f, omega_o: Vector3f) -> Numbers:
+    def at(
+        hit: Point2f,
+        found: Numbers,
+        level: Float,
+        omega_i: Vector3f,
+        omega_o: Vector3f,
+        lit: DirectLight | None,
+        place: int,
+    ) -> Numbers:
         x, y, *moments = found[:5]
         center, spread, base = mi.Point2f(x, y), _spread(x, y, *moments), mi.Color3f(*found[5:8])
         length2 = dr.squared_norm(center)
         upright = dr.rsqrt(1.0 + length2)
-        light = visibility(hit, level, omega_i) / omega_i.z
-        irradiance = light * upright * _shown(omega_i, center, spread)
+        towards = omega_i if lit is None else dr.select(lit.flat, omega_i, lit.omega_i)
+        light = visibility(hit, level, towards)
+        if lit is not None:
+            bent = lit.light(light, place)
+        light = light / omega_i.z
+        if lit is not None:
+            light = dr.select(lit.flat, light, bent)
+        irradiance = light * upright * _shown(towards, center, spread)
         core = irradiance * base / math.pi
         if channels == DIFFUSE_CHANNELS:
             return [irradiance, -upright * x, -upright * y, *core]
@@ -105,13 +147,19 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
             core += weight * dr.fma(1.0 - CLEARCOAT_F0, rest, CLEARCOAT_F0) * lobe(alpha2)
         return [irradiance, -upright * x, -upright * y, *core]
 
-    def step(hits: Numbers, level: Numbers, omega_i: Numbers, omega_o: Numbers) -> Numbers:
+    def step(
+        hits: Numbers,
+        level: Numbers,
+        omega_i: Numbers,
+        omega_o: Numbers,
+        lit: DirectLight | None = None,
+    ) -> Numbers:
         places = [mi.Point2f(*hits[k : k + 2]) for k in range(0, len(hits), 2)]
         common = (level[0] + op.finer, mi.Vector3f(*omega_i), mi.Vector3f(*omega_o))
         read = [maps.blended(hit, common[0]) for hit in places]
         # A basic block of its own: four places in one spill registers, which takes 5% of the kernel's time.
         dr.detail.new_scope(dr.backend_v(mi.Float))
-        parts = [at(hit, found, *common) for hit, found in zip(places, read, strict=True)]
+        parts = [at(hit, read[k], *common, lit, k) for k, hit in enumerate(places)]
         return [sum(column) / len(parts) for column in zip(*parts, strict=True)]
 
     return step

@@ -89,7 +89,7 @@ def _inverse(x: Float) -> Float:
     return dr.rcp(dr.select(x >= 0, dr.maximum(x, _TINY), dr.minimum(x, -_TINY)))
 
 
-def _start(
+def start_traversal(
     heightfield: HeightField, ray: Ray3f, active: Mask, below: Mask
 ) -> tuple[TraversalState, RayConstants]:
     dx, dy, dz = ray.d.x / heightfield.cell[0], ray.d.y / heightfield.cell[1], ray.d.z
@@ -129,6 +129,86 @@ def _above(z: Float, x: Float, y: Float, constants: RayConstants, node: Vector4f
     return constants.side * here, constants.side * slope
 
 
+@dataclass(frozen=True)
+class Block:
+    """The block of cells that a ray is in, and the ray's way to its border.
+
+    Attributes
+    ----------
+    left, low : first column and row; width, height : numbers of cells
+    x, y : position in the block, in cells
+    leaf : whether the block is a single cell
+    node : its row of the table
+    to_x, to_y : distances to the borders that the ray approaches
+    """
+
+    left: Int32
+    low: Int32
+    width: Int32
+    height: Int32
+    x: Float
+    y: Float
+    leaf: Mask
+    node: Vector4f
+    to_x: Float
+    to_y: Float
+
+    @classmethod
+    def of(cls, heightfield: HeightField, state: TraversalState, constants: RayConstants) -> Block:
+        """The block of the state's level."""
+        size = mi.Int32(1) << state.level
+        i, j = state.column & (size - 1), state.row & (size - 1)
+        left, low = state.column - i, state.row - j
+        x, y = mi.Float(i) + state.x, mi.Float(j) + state.y
+        leaf = state.level == 0
+        first = (mi.Int32(1) << (heightfield.both_log2 - 2 * state.level)) + heightfield.cells
+        index = state.row >> state.level << (heightfield.columns_log2 - state.level)
+        index += state.column >> state.level
+        if heightfield.powers:
+            width = height = size
+            index += dr.select(leaf, 0, first)
+        else:
+            width = dr.minimum(size, heightfield.columns - left)
+            height = dr.minimum(size, heightfield.rows - low)
+            index = dr.select(leaf, state.row * heightfield.columns + state.column, index + first)
+        if heightfield.two_sided:
+            index += dr.select(constants.side < 0, heightfield.below, 0)
+        node = dr.gather(mi.Vector4f, heightfield.nodes, index)
+        to_x = (dr.select(constants.right, mi.Float(width), 0.0) - x) * constants.over_x
+        to_y = (dr.select(constants.up, mi.Float(height), 0.0) - y) * constants.over_y
+        return cls(left, low, width, height, x, y, leaf, node, to_x, to_y)
+
+    def leave(
+        self, heightfield: HeightField, state: TraversalState, constants: RayConstants, end: Float, free: Mask
+    ) -> tuple[Int32, Int32]:
+        """Move the state by `end`, into the next block where lanes are `free`, else one level down; returns
+        its cell before it wraps at the period, which the state does not have yet."""
+        x, y = dr.fma(end, constants.x, self.x), dr.fma(end, constants.y, self.y)
+        along_x = free & (self.to_x <= self.to_y)
+        along_y = free & ~along_x
+        i = dr.select(
+            along_x, dr.select(constants.right, self.width, -1), dr.clip(mi.Int32(x), 0, self.width - 1)
+        )
+        j = dr.select(
+            along_y, dr.select(constants.up, self.height, -1), dr.clip(mi.Int32(y), 0, self.height - 1)
+        )
+        state.x = dr.select(along_x, dr.select(constants.right, 0.0, 1.0), x - mi.Float(i))
+        state.y = dr.select(along_y, dr.select(constants.up, 0.0, 1.0), y - mi.Float(j))
+        i, j = self.left + i, self.low + j
+        leaves_parent = ((i ^ state.column) | (j ^ state.row)) >> (state.level + 1) != 0
+        above = dr.select(leaves_parent, dr.minimum(state.level + 1, heightfield.finest), state.level)
+        state.level = dr.select(free, above, dr.maximum(state.level - 1, 0))
+        # Modulo the period.
+        if heightfield.powers:
+            state.column, state.row = i & (heightfield.columns - 1), j & (heightfield.rows - 1)
+        else:
+            state.column = dr.select(
+                i < 0, heightfield.columns - 1, dr.select(i >= heightfield.columns, 0, i)
+            )
+            state.row = dr.select(j < 0, heightfield.rows - 1, dr.select(j >= heightfield.rows, 0, j))
+        return i, j
+
+
 def _step(
     heightfield: HeightField, state: TraversalState, constants: RayConstants, max_crossings: UInt32
 ) -> TraversalState:
@@ -137,59 +217,22 @@ def _step(
     Rays that hit the surface stay in their cell. Rays that ended otherwise may be stepped further, without
     effect on the result.
     """
-    # The block, and the ray's position in it.
-    size = mi.Int32(1) << state.level
-    i, j = state.column & (size - 1), state.row & (size - 1)
-    left, low = state.column - i, state.row - j
-    x, y = mi.Float(i) + state.x, mi.Float(j) + state.y
-    leaf = state.level == 0
-    first = (mi.Int32(1) << (heightfield.both_log2 - 2 * state.level)) + heightfield.cells
-    index = state.row >> state.level << (heightfield.columns_log2 - state.level)
-    index += state.column >> state.level
-    if heightfield.powers:
-        width = height = size
-        index += dr.select(leaf, 0, first)
-    else:
-        width, height = dr.minimum(size, heightfield.columns - left), dr.minimum(size, heightfield.rows - low)
-        index = dr.select(leaf, state.row * heightfield.columns + state.column, index + first)
-    if heightfield.two_sided:
-        index += dr.select(constants.side < 0, heightfield.below, 0)
-    node = dr.gather(mi.Vector4f, heightfield.nodes, index)
-
-    # Distance to the block's border, and the height above the surface here, there and at a cell's diagonal.
-    to_x = (dr.select(constants.right, mi.Float(width), 0.0) - x) * constants.over_x
-    to_y = (dr.select(constants.up, mi.Float(height), 0.0) - y) * constants.over_y
-    end = dr.maximum(dr.minimum(to_x, to_y), 0.0)
-    here, slope = _above(state.z, x, y, constants, node)
-    across = x + y - 1.0
-    fold = constants.side * (dr.maximum(dr.fma(end, constants.both, across), 0.0) * node.w)
+    block = Block.of(heightfield, state, constants)
+    # The height above the surface here, at the block's border and at a cell's diagonal.
+    end = dr.maximum(dr.minimum(block.to_x, block.to_y), 0.0)
+    here, slope = _above(state.z, block.x, block.y, constants, block.node)
+    across = block.x + block.y - 1.0
+    fold = constants.side * (dr.maximum(dr.fma(end, constants.both, across), 0.0) * block.node.w)
     diagonal = across * constants.over_both
     under = (diagonal > 0) & (diagonal < end) & (dr.fma(diagonal, slope, here) <= 0)
     # NaN counts as a hit: it must reach the value, where the sample is detected and drawn again.
-    free = (dr.fma(end, slope, here) - fold > 0) & (leaf | (here > 0)) & ~under
-    state.hit |= state.searching & leaf & ~free
+    free = (dr.fma(end, slope, here) - fold > 0) & (block.leaf | (here > 0)) & ~under
+    state.hit |= state.searching & block.leaf & ~free
 
     # Skip the block, into the next cell.
     end = dr.select(free, end, 0.0)
-    x, y = dr.fma(end, constants.x, x), dr.fma(end, constants.y, y)
     state.z = dr.fma(end, constants.z, state.z)
-    along_x = free & (to_x <= to_y)
-    along_y = free & ~along_x
-    i = dr.select(along_x, dr.select(constants.right, width, -1), dr.clip(mi.Int32(x), 0, width - 1))
-    j = dr.select(along_y, dr.select(constants.up, height, -1), dr.clip(mi.Int32(y), 0, height - 1))
-    state.x = dr.select(along_x, dr.select(constants.right, 0.0, 1.0), x - mi.Float(i))
-    state.y = dr.select(along_y, dr.select(constants.up, 0.0, 1.0), y - mi.Float(j))
-    i, j = left + i, low + j
-    leaves_parent = ((i ^ state.column) | (j ^ state.row)) >> (state.level + 1) != 0
-    above = dr.select(leaves_parent, dr.minimum(state.level + 1, heightfield.finest), state.level)
-    state.level = dr.select(free, above, dr.maximum(state.level - 1, 0))
-
-    # Modulo the period.
-    if heightfield.powers:
-        state.column, state.row = i & (heightfield.columns - 1), j & (heightfield.rows - 1)
-    else:
-        state.column = dr.select(i < 0, heightfield.columns - 1, dr.select(i >= heightfield.columns, 0, i))
-        state.row = dr.select(j < 0, heightfield.rows - 1, dr.select(j >= heightfield.rows, 0, j))
+    i, j = block.leave(heightfield, state, constants, end, free)
     gone = constants.rising & (state.z >= heightfield.top)
     if heightfield.two_sided:
         below = ~constants.rising & (state.z <= heightfield.bottom)
@@ -271,13 +314,13 @@ def _search(
     rng: Any,
 ) -> tuple[TraversalState, RayConstants, Any]:
     """Traverse until rays hit an opaque point; at each hit the opacity decides by chance whether it is."""
-    state, constants = _start(heightfield, ray, active, below)
+    state, constants = start_traversal(heightfield, ray, active, below)
     if dr.hint(holes is None, mode="scalar"):
         state = _follow(heightfield, state, constants, max_crossings)
     else:
         ray, below, searching = mi.Ray3f(ray), mi.Bool(below), mi.Bool(active)
         while dr.hint(searching, exclude=[heightfield, holes, constants]):
-            segment, segment_constants = _start(heightfield, ray, searching, below)
+            segment, segment_constants = start_traversal(heightfield, ray, searching, below)
             segment.crossings = state.crossings
             state = _follow(heightfield, segment, segment_constants, max_crossings)
             si = _surface(heightfield, state, segment_constants, ray.d)
@@ -285,7 +328,7 @@ def _search(
             state.hit &= ~searching
             ray.o = dr.select(searching, heightfield.leave(si, ray.d).o, ray.o)
             below ^= searching
-        constants = _start(heightfield, ray, active, below)[1]
+        constants = start_traversal(heightfield, ray, active, below)[1]
     return state, constants, rng
 
 
@@ -330,16 +373,16 @@ class HeightfieldGeometry(HeightField):
         shadow_below: Mask = False,
     ) -> tuple[SurfaceInteraction3f, Mask, Mask, Mask]:
         """Both in one loop."""
-        state, constants = _start(self, ray, active, below)
-        shadow, shadow_constants = _start(self, shadow_ray, shadow_active, shadow_below)
+        state, constants = start_traversal(self, ray, active, below)
+        shadow, shadow_constants = start_traversal(self, shadow_ray, shadow_active, shadow_below)
         state, shadow = _follow_two(self, state, constants, shadow, shadow_constants, max_crossings)
         hit = _surface(self, state, constants, ray.d)
         return hit, state.capped, shadow.hit | shadow.capped, shadow.capped
 
 
-def closest_height(heightfield: HeightField, ray: Ray3f, max_crossings: int) -> Float:
+def closest_height(heightfield: HeightField, ray: Ray3f, max_crossings: int, active: Mask = True) -> Float:
     """Heights in scene units of the first intersections of rays from above; of rays that would cross more
     than `max_crossings` borders of the tile, the height there."""
-    state, constants = _start(heightfield, ray, mi.Bool(True), mi.Bool(False))
+    state, constants = start_traversal(heightfield, ray, mi.Bool(active), mi.Bool(False))
     state = _follow(heightfield, state, constants, max_crossings)
     return dr.select(state.hit, _surface(heightfield, state, constants, ray.d).p.z, state.z)

@@ -1,0 +1,73 @@
+"""Curvature of Mitsuba's surfaces at hits, from derivatives of their shading normals.
+
+Mitsuba's own integrators do not ask for these derivatives, and those of a mesh are with respect to the
+barycentric coordinates of a triangle, not to uv (Mitsuba 3.9). Here they follow from the shape, which is
+asked again.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from mbtf_gen.engine.types import Float, SurfaceInteraction3f, Vector3f
+
+
+def with_normal_partials(si: SurfaceInteraction3f, active: Any = True) -> SurfaceInteraction3f:
+    """`si` with the derivatives of the shading normal by uv; 0 for instances, whose frame is unknown."""
+    si = type(si)(si)
+    active = active & si.is_valid() & (si.instance == None)  # noqa: E711
+    towards = si.to_world(si.wi)
+    ray = mi.Ray3f(si.p + towards, -towards)
+    pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(si.t))
+    pi.t, pi.shape, pi.prim_index = 1.0, si.shape, si.prim_index
+    flags = mi.RayFlags.All | mi.RayFlags.dNSdUV
+
+    def at(u: float, v: float) -> SurfaceInteraction3f:
+        pi.prim_uv = mi.Point2f(u, v)
+        return si.shape.compute_surface_interaction(ray, pi, flags, active)
+
+    mesh = si.shape.is_mesh()
+    first, *others = (at(*corner) for corner in ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
+    (du1, dv1), (du2, dv2) = (other.uv - first.uv for other in others)
+    dn1, dn2 = (mi.Vector3f(other.sh_frame.n - first.sh_frame.n) for other in others)
+    determinant = du1 * dv2 - dv1 * du2
+    inverse = dr.select(mesh & (determinant != 0.0), dr.rcp(determinant), 0.0)
+    si.dn_du = dr.select(mesh, (dv2 * dn1 - dv1 * dn2) * inverse, first.dn_du)
+    si.dn_dv = dr.select(mesh, (du1 * dn2 - du2 * dn1) * inverse, first.dn_dv)
+    si.dn_du = dr.select(active, si.dn_du, 0.0)
+    si.dn_dv = dr.select(active, si.dn_dv, 0.0)
+    return si
+
+
+def curvature(si: SurfaceInteraction3f, area: Float) -> tuple[Float, Float, Float]:
+    """Second fundamental form (xx, xy, yy) in the shading frame, times the tile's width: positive where the
+    surface is convex.
+
+    Parameters
+    ----------
+    si : with derivatives of the normal
+    area : area of a unit of uv in squared tile widths
+    """
+    du, dv, nu, nv = (si.sh_frame.to_local(mi.Vector3f(w)) for w in (si.dp_du, si.dp_dv, si.dn_du, si.dn_dv))
+    determinant = du.x * dv.y - du.y * dv.x
+    inverse = dr.select(determinant != 0.0, dr.rcp(determinant), 0.0)
+    scale = inverse * dr.sqrt(dr.abs(determinant) / area)
+    xx = (nu.x * dv.y - nv.x * du.y) * scale
+    yy = (nv.y * du.x - nu.y * dv.x) * scale
+    xy = 0.5 * ((nv.x * du.x - nu.x * dv.x) + (nu.y * dv.y - nv.y * du.y)) * scale
+    return xx, xy, yy
+
+
+def rotated(form: tuple[Float, Float, Float], c: Float, s: Float, hand: Float) -> Vector3f:
+    """The form in a frame that is rotated by an angle of cosine c and sine s, and reflected where `hand` is
+    -1."""
+    xx, xy, yy = form
+    cc, cs, ss = c * c, c * s, s * s
+    return mi.Vector3f(
+        cc * xx + 2.0 * cs * xy + ss * yy,
+        hand * ((cc - ss) * xy - cs * (xx - yy)),
+        ss * xx - 2.0 * cs * xy + cc * yy,
+    )

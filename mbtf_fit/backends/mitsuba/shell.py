@@ -1,0 +1,199 @@
+"""The shell of heights of a material over a curved surface: where view rays meet it, and its light.
+
+The surface is the top of the shell. A ray that misses the heights passes through, so that silhouettes are
+those of the displacement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from mbtf_fit.backends.mitsuba.arcs import Arc, tilt, trace_arcs
+from mbtf_fit.ops import Trace
+from mbtf_gen.engine.types import Float, Mask, Point2f, Vector2f, Vector3f
+from mbtf_gen.tile.tracers.heightfield import HeightField
+from mbtf_gen.tile.tracers.heightfield_tracer import closest_height
+
+# Largest depth of a shell in radii of curvature: sharper edges are traced as if they were that round.
+DEEPEST = 0.5
+# Depth below the lowest height at which rays end, as a share of the shell: the rounding of single precision.
+_MARGIN = 1e-3
+# Height above the surface at which shadow rays start, as a share of the shell.
+_CLEARANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class ShellHit:
+    """Where view rays meet the heights over a surface.
+
+    Attributes
+    ----------
+    shell : the heights
+    share : rays of the footprint that meet them
+    u : uv of the reference plane from which a ray over a plane, in the frame there, meets the same point
+    heights : heights of the intersections, one per place
+    curvature, flat : of the surface; where it has none
+    tilt : change of the normal's horizontal part from the top of the shell to there, an angle
+    leaves : whether the ray, reversed, passes the shell where the surface curves away from it
+    omega_o : towards the viewer in the frame there, raised to the lowest directions with data where curved
+    values : results of the operation ``trace``
+    """
+
+    shell: Shell
+    share: Float
+    u: Point2f
+    heights: list[Float]
+    curvature: Vector3f
+    flat: Mask
+    tilt: Vector2f
+    leaves: Mask
+    omega_o: Vector3f
+    values: dict[str, list[Float]]
+
+    def light_cosine(self, omega_i: Vector3f, least: Float, visible: Sequence[tuple[Float, Float]]) -> Float:
+        """The light's cosine. Below the least with data it is that where the light is visible; elsewhere,
+        light that others scatter falls to 0 at the dip of the horizon from the top of the shell."""
+        flat = mi.Vector2f(omega_i.x, omega_i.y)
+        bend = dr.dot(tilt(self.curvature, flat), flat)
+        dip = dr.minimum(dr.sqrt(dr.maximum(2.0 * bend * self.shell.depth, 0.0)), 1.0)
+        low = least * dr.square(dr.maximum(omega_i.z + dip, 0.0) / (least + dip))
+        share = sum(curved for curved, _ in visible) / len(visible)
+        return dr.select(omega_i.z < least, dr.lerp(low, least, share), omega_i.z)
+
+    def visibility(self, omega_i: Vector3f) -> list[tuple[Float, Float]]:
+        """Visibility of the light from the intersection of each place, 1 or 0, and what it would be over a
+        plane; light in the frame there."""
+        out, hits, depth = [], self.values[self.shell.op.hits], self.shell.depth
+        longest = float(self.shell.op.crossings)
+        for k, height in enumerate(self.heights):
+            # Off the surface by more than the rounding of its height.
+            start = dr.fma(_CLEARANCE, depth, height)
+            at = mi.Point2f(*hits[2 * k : 2 * k + 2])
+            pair = []
+            for curvature in (self.curvature, mi.Vector3f(0.0)):
+                arc = Arc.of(omega_i, curvature, depth, longest, start)
+                found, *_ = trace_arcs(self.shell.heightfield, at, arc, self.shell.aspect, ~self.flat)
+                pair.append(dr.select(found, mi.Float(0.0), 1.0))
+            out.append((pair[0], pair[1]))
+        return out
+
+
+@dataclass(frozen=True)
+class Shell:
+    """Heights that view rays of a footprint are traced to.
+
+    Attributes
+    ----------
+    op : the operation
+    heightfield : the heights, in tile widths
+    aspect : height of the tile over its width
+    """
+
+    op: Trace
+    heightfield: HeightField
+    aspect: float
+
+    @property
+    def depth(self) -> Float:
+        """Depth at which rays end, below the lowest height by more than rounding."""
+        return dr.fma(-(1.0 + _MARGIN), self.heightfield.bottom, 1e-6)
+
+    def places(self, u: Sequence[Float], level: Float, omega_o: Sequence[Float]) -> Iterator[list[Float]]:
+        """uv of the places of a footprint."""
+        sigma = 0.5 * dr.exp2(-level)
+        flat = mi.Vector2f(omega_o[0], omega_o[1])
+        length = dr.sqrt(dr.fma(flat.x, flat.x, dr.square(flat.y)))
+        along = dr.select(length > 0.0, flat / length, mi.Vector2f(1.0, 0.0))
+        for x, y in self.op.places:
+            yield [
+                u[0] + sigma * (y * along.x - x * along.y),
+                u[1] + sigma * ((y * along.y + x * along.x) / self.aspect),
+            ]
+
+    def flat_height(self, u: Sequence[Float], omega_o: Sequence[Float], active: Mask = True) -> Float:
+        """Heights at which rays through points of a plane meet the heights."""
+        x, y = (c - dr.floor(c) for c in u)
+        ray = mi.Ray3f(mi.Point3f(x - 0.5, (y - 0.5) * self.aspect, 0.0), -mi.Vector3f(*omega_o))
+        return closest_height(self.heightfield, ray, self.op.crossings, active)
+
+    def meet(
+        self, u: Point2f, level: Float, omega_o: Vector3f, curvature: Vector3f, min_cos: Float
+    ) -> ShellHit:
+        """Trace view rays over a surface of curvatures (xx, xy, yy), in 1/tile width."""
+        largest = dr.maximum(dr.abs(curvature.x), dr.abs(curvature.z)) + dr.abs(curvature.y)
+        curvature = curvature * dr.minimum(1.0, DEEPEST / dr.maximum(largest * self.depth, 1e-9))
+        flat = (curvature.x == 0) & (curvature.y == 0) & (curvature.z == 0)
+        arc = Arc.of(-omega_o, curvature, self.depth, float(self.op.crossings))
+        lowest = clamped(omega_o, min_cos)
+        found = []
+        for at in self.places(u, level, lowest):
+            hit, s, z = trace_arcs(self.heightfield, mi.Point2f(*at), arc, self.aspect, ~flat)
+            over_plane = self.flat_height(at, lowest, flat)
+            place = [
+                dr.select(flat, a, dr.fma(s, b, c))
+                for a, b, c in zip(
+                    displaced(at, over_plane, lowest, self.aspect),
+                    (arc.azimuth.x, arc.azimuth.y / self.aspect),
+                    at,
+                    strict=True,
+                )
+            ]
+            found.append((hit | flat, dr.select(flat, over_plane, z), s, place))
+        count = sum(dr.select(hit, mi.Float(1.0), 0.0) for hit, *_ in found)
+
+        def mean(values: Iterable[tuple[Mask, Float]]) -> Float:
+            return sum(dr.select(hit, value, 0.0) for hit, value in values) / dr.maximum(count, 1.0)
+
+        z, s, x, y = (
+            mean((hit, (height, along, *place)[k]) for hit, height, along, place in found) for k in range(4)
+        )
+        # Places whose ray misses do not count.
+        hits = [
+            c
+            for hit, _, _, place in found
+            for c in (dr.select(hit, place[0], x), dr.select(hit, place[1], y))
+        ]
+        bend = dr.select(flat, 0.0, s) * tilt(curvature, arc.azimuth)
+        there = dr.select(flat, omega_o, clamped(tilted(omega_o, bend), min_cos))
+        before = displaced([x, y], -z, there, self.aspect)
+        return ShellHit(
+            self,
+            count / len(found),
+            dr.select(flat, u, mi.Point2f(*before)),
+            [dr.select(hit, height, z) for hit, height, *_ in found],
+            curvature,
+            flat,
+            bend,
+            Arc.of(omega_o, curvature, self.depth, float(self.op.crossings)).passes,
+            there,
+            {self.op.output: [z], self.op.hits: hits},
+        )
+
+
+def clamped(w: Vector3f, min_cos: Float) -> Vector3f:
+    """Directions, raised to the lowest ones with data."""
+    sine, largest = dr.sqrt(dr.fma(w.x, w.x, w.y * w.y)), dr.sqrt(1.0 - min_cos * min_cos)
+    low = (sine > largest) | (w.z < 0)
+    scale = dr.select(low, largest / sine, 1.0)
+    return mi.Vector3f(w.x * scale, w.y * scale, dr.select(low, min_cos, w.z))
+
+
+def displaced(u: Sequence[Float], height: Float, omega_o: Sequence[Float], aspect: float) -> list[Float]:
+    """uv of the points at heights on lines through points of the plane."""
+    step = height / omega_o[2]
+    return [dr.fma(step, omega_o[0], u[0]), dr.fma(step / aspect, omega_o[1], u[1])]
+
+
+def tilted(w: Vector3f, tilt: Vector2f, back: bool = False) -> Vector3f:
+    """Directions in a frame whose normal is rotated by an angle towards a direction, or back from it."""
+    angle = dr.norm(tilt)
+    d = dr.select(angle > 0.0, tilt / angle, mi.Vector2f(1.0, 0.0))
+    sin, cos = dr.sincos(-angle if back else angle)
+    p = dr.fma(w.x, d.x, w.y * d.y)
+    step = dr.fma(p, cos, -w.z * sin) - p
+    rotated = mi.Vector3f(dr.fma(step, d.x, w.x), dr.fma(step, d.y, w.y), dr.fma(p, sin, w.z * cos))
+    return dr.select(angle > 0.0, rotated, w)

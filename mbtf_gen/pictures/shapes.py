@@ -1,0 +1,271 @@
+"""Displaced shapes, path-traced by unmodified Mitsuba: what a material on a curved object should look like.
+
+The tiles of a shape are conformal: square everywhere, with a width s that varies over it. The widest are as
+wide as a tile of the plane, the unit of length. The surface is the top of the material, as on the plane: a
+point (x, y) of the tiles lies at ``p + s z n``, z ≤ 0. N tiles around, with ``R = N/2π``:
+
+- cylinder: radius R, N tiles long, s = 1;
+- sphere: radius R, a Mercator projection up to 84° of latitude, s the cosine of the latitude;
+- torus: outer radius R; a tube of M ≈ N/2 tiles around, whose ratio of radii is r/R₀ = k/√(1+k²), k = M a/N.
+
+The axis of a shape is z. A picture shows radiance in 1/sr under a distant light of irradiance 1 across its
+rays, and no background. Opacity and normal maps are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mbtf_core.data.schema import ARRAY
+from mbtf_core.errors import InputError, UsageError
+from mbtf_core.images.exr import write_channels
+from mbtf_core.pictures import PIXEL_SIGMA, Camera
+from mbtf_gen.config.pictures import Shape
+from mbtf_gen.job import Job
+from mbtf_gen.tile.heights import MOST_CELLS, HeightGrid, grid_faces
+
+F64 = NDArray[np.float64]
+# Latitude beyond which the sphere's tiles no longer shrink.
+_STEEPEST = np.radians(84.0)
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A shape with tiles.
+
+    Attributes
+    ----------
+    shape : its name
+    around : tiles around the axis
+    aspect : height of a tile over its width
+    """
+
+    shape: Shape
+    around: int
+    aspect: float
+
+    @property
+    def radius(self) -> float:
+        """Largest distance from the axis, in tile widths."""
+        return self.around / (2.0 * np.pi)
+
+    @property
+    def along(self) -> tuple[float, float]:
+        """Range of y, in tile widths; that of a torus has whole tiles."""
+        if self.shape == "torus":
+            return 0.0, max(1, round(self.around / (2.0 * self.aspect))) * self.aspect
+        if self.shape == "cylinder":
+            return -0.5 * self.around, 0.5 * self.around
+        pole = np.arctanh(np.sin(_STEEPEST)) + (np.pi / 2 - _STEEPEST) / np.cos(_STEEPEST)
+        return -self.radius * float(pole), self.radius * float(pole)
+
+    def at(self, x: F64, y: F64) -> tuple[F64, F64, F64]:
+        """Positions (..., 3), outward normals (..., 3) and widths of a tile (...) at places of the tiles, all
+        lengths in tile widths."""
+        azimuth, north = np.broadcast_arrays(x / self.radius, y / self.radius)
+        if self.shape == "cylinder":
+            n = _around(azimuth, np.ones_like(north), np.zeros_like(north))
+            return _around(azimuth, np.full_like(north, self.radius), y + 0.0 * north), n, np.ones_like(north)
+        if self.shape == "sphere":
+            turn = np.arctanh(np.sin(_STEEPEST))
+            beyond = np.clip(np.abs(north) - turn, 0.0, None) * np.cos(_STEEPEST)
+            latitude = np.arctan(np.sinh(np.clip(north, -turn, turn))) + np.sign(north) * beyond
+            n = _around(azimuth, np.cos(latitude), np.sin(latitude))
+            return self.radius * n, n, np.cos(np.clip(latitude, -_STEEPEST, _STEEPEST))
+        k = self.along[1] / self.around
+        share = k / np.sqrt(1.0 + k * k)
+        major = self.radius / (1.0 + share)
+        # With r = share: dy/R = r dθ / (1 + r cos θ), whose integral over the tube is 2π k.
+        half = np.pi * (y / self.along[1] - 0.5) + 0.0 * north
+        angle = 2.0 * np.arctan2(np.sqrt(1.0 + share) * np.sin(half), np.sqrt(1.0 - share) * np.cos(half))
+        n = _around(azimuth, np.cos(angle), np.sin(angle))
+        from_axis = major * (1.0 + share * np.cos(angle))
+        return _around(azimuth, from_axis, major * share * np.sin(angle)), n, from_axis / self.radius
+
+    def mesh(self, grid: HeightGrid | None, bsdf: Any, cells: int = 32) -> Any:
+        """The displaced shape as a mesh of Mitsuba; without heights smooth surface, of `cells` per tile.
+
+        Texture coordinates are in tile widths over (1, aspect), v downwards.
+
+        Raises
+        ------
+        InputError : too many triangles
+        """
+        rows, columns = (round(cells * self.aspect), cells) if grid is None else grid.z.shape
+        low, high = (round(end / self.aspect * rows) for end in self.along)
+        across = self.around * columns
+        count = (high - low) * across
+        if count > MOST_CELLS:
+            raise InputError(
+                f"the {self.shape} has {count:,} cells; at most {MOST_CELLS:,} can be traced",
+                where="--mesh",
+                hint=f"give --mesh {int(columns * (MOST_CELLS / count) ** 0.5)}, or fewer --tiles-around",
+            )
+        i, j = np.arange(across + 1), np.arange(low, high + 1)
+        x, y = (i + 0.5) / columns, ((j + 0.5) / rows) * self.aspect
+        p, n, width = self.at(x[None], y[:, None])
+        if grid is not None:
+            z = grid.z[::-1][np.ix_(j % rows, i % columns)]
+            p = p + (width * z)[..., None] * n
+        uv = np.stack(np.broadcast_arrays(x[None], 1.0 - y[:, None] / self.aspect), -1)
+        # Rows of :func:`grid_faces` run downwards.
+        order = slice(None, None, -1)
+        return _mesh(p[order], uv[order], None if grid is not None else n[order], bsdf)
+
+
+def _around(azimuth: F64, radius: F64, z: F64) -> F64:
+    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], -1)
+
+
+def _mesh(p: F64, uv: F64, n: F64 | None, bsdf: Any) -> Any:
+    import mitsuba as mi
+
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict(bsdf) if isinstance(bsdf, dict) else bsdf
+    props["face_normals"] = n is None
+    faces = grid_faces(*p.shape[:2])
+    mesh = mi.Mesh(
+        "shape",
+        p.shape[0] * p.shape[1],
+        len(faces),
+        has_vertex_normals=n is not None,
+        has_vertex_texcoords=True,
+        props=props,
+    )
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = p.astype(np.float32).ravel()
+    parameters["vertex_texcoords"] = uv.astype(np.float32).ravel()
+    parameters["faces"] = faces.ravel()
+    if n is not None:
+        parameters["vertex_normals"] = n.astype(np.float32).ravel()
+    parameters.update()
+    return mesh
+
+
+def shape_scene(mesh: Any, camera: Camera, omega_i: NDArray[Any], integrator: dict[str, Any]) -> Any:
+    """A scene of Mitsuba: a shape around the origin that the camera looks at, a light, no background."""
+    import mitsuba as mi
+
+    forward, _, up = camera.frame()
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"hide_emitters": True, **integrator},
+            "sensor": {
+                "type": "perspective",
+                "fov": camera.field_of_view,
+                "fov_axis": "x",
+                "to_world": mi.ScalarTransform4f().look_at(
+                    (-camera.distance * forward).tolist(), [0.0, 0.0, 0.0], up.tolist()
+                ),
+                "sampler": {"type": "independent"},
+                "film": {
+                    "type": "hdrfilm",
+                    "width": camera.columns,
+                    "height": camera.rows,
+                    "rfilter": {"type": "gaussian", "stddev": PIXEL_SIGMA},
+                    "pixel_format": "rgba",
+                    "component_format": "float32",
+                    "sample_border": True,
+                },
+            },
+            "light": {"type": "directional", "direction": [-float(c) for c in omega_i], "irradiance": 1.0},
+            "shape": mesh,
+        }
+    )
+
+
+@dataclass(frozen=True)
+class ShapeImage:
+    """A picture of a shape.
+
+    Attributes
+    ----------
+    value_a, value_b : (rows, columns, 3) float32 array
+        Independent halves, in 1/sr for unit irradiance.
+    transmittance : (rows, columns) float32 array
+        Share of a pixel that shows the background.
+    spp : paths per pixel, both halves together
+    """
+
+    value_a: NDArray[np.float32]
+    value_b: NDArray[np.float32]
+    transmittance: NDArray[np.float32]
+    spp: int
+
+    @property
+    def value(self) -> NDArray[np.float32]:
+        """Mean of the halves, (rows, columns, 3)."""
+        return 0.5 * (self.value_a + self.value_b)
+
+    def write(self, path: Path) -> Path:
+        """Write ``path`` + ``.exr``, atomically, and return its path."""
+        rows, columns = self.transmittance.shape
+        arrays = {**vars(self), "spp": np.full((rows, columns), self.spp, np.float32)}
+        channels = {
+            channel: np.ascontiguousarray(np.atleast_3d(array)[..., index])
+            for name, array in arrays.items()
+            for index, channel in enumerate(ARRAY[name].channels)
+        }
+        exr = path.with_name(f"{path.name}.exr")
+        write_channels(exr, channels, {"mbtf.lead": f"1,{rows},{columns}"})
+        return exr
+
+
+def render_shape(
+    source: Job,
+    shape: Shape,
+    around: int,
+    camera: Camera,
+    omega_i: NDArray[Any],
+    spp: int = 256,
+    seed: int = 0,
+    index: int = 0,
+    max_depth: int = -1,
+) -> ShapeImage:
+    """Path-trace a displaced shape with Mitsuba's own path tracer.
+
+    Parameters
+    ----------
+    source : the material
+    shape, around : the shape, and the tiles around its axis
+    camera : looks at the shape's center
+    omega_i : (3,) float array
+        Unit vector towards the light.
+    spp : paths per pixel, both halves together; even
+    seed, index : root seed of the random numbers, and number of the picture
+    max_depth : longest path in segments; 2 is direct light, -1 has no limit
+
+    Raises
+    ------
+    UsageError : the material is no height field of maps
+    InputError : too many triangles
+    """
+    from mbtf_gen.engine.runtime import load_mitsuba
+
+    load_mitsuba()
+    from mbtf_gen.render.scene import register_plugins
+
+    register_plugins()
+    material = source.material.with_maps(opacity=None)
+    grid, surface = material.grid, material.surface()
+    if grid is None or not isinstance(surface, dict):
+        raise UsageError("displaces height maps only", where="--surface")
+    mesh = Chart(shape, around, material.aspect).mesh(grid, surface)
+    path = {"type": "path", "max_depth": max_depth, "rr_depth": 8}
+    return render_scene(shape_scene(mesh, camera, omega_i, path), spp, [seed, index])
+
+
+def render_scene(scene: Any, spp: int, seed: Sequence[int]) -> ShapeImage:
+    """Two halves of a picture of :func:`shape_scene`, with `spp`/2 paths per pixel each."""
+    import mitsuba as mi
+
+    seeds = np.random.default_rng([*seed, 2]).integers(1 << 31, size=2)
+    a, b = (np.array(mi.render(scene, spp=max(1, spp // 2), seed=int(s)), np.float32) for s in seeds)
+    return ShapeImage(a[..., :3], b[..., :3], 1.0 - 0.5 * (a + b)[..., 3], spp)

@@ -1,0 +1,167 @@
+"""Curvature of surfaces, and view rays in the shell of heights over them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from support.known_surfaces import rough_heights
+from support.plugin_materials import write_material
+from support.plugin_scenes import plane
+from support.scenes import mi
+
+from mbtf_core.errors import UsageError
+from mbtf_fit.backends.mitsuba import load_scene
+from mbtf_fit.backends.mitsuba.arcs import Arc, trace_arcs
+from mbtf_fit.backends.mitsuba.curvature import curvature, rotated, with_normal_partials
+from mbtf_fit.backends.mitsuba.shell import tilted
+from mbtf_gen.pictures.shapes import Chart
+from mbtf_gen.tile.tracers.heightfield import HeightField
+
+F64 = NDArray[np.float64]
+DEPTH = 0.25
+
+
+def hits(scene: Any, n: int = 64, seed: int = 0) -> Any:
+    """Hits of parallel rays on a shape around the origin."""
+    random = np.random.default_rng(seed).uniform(-0.6, 0.6, (2, n)).astype(np.float32)
+    origin = mi.Point3f(-20.0, mi.Float(random[0]), mi.Float(random[1]))
+    return scene.ray_intersect(mi.Ray3f(origin, mi.Vector3f(1, 0, 0)))
+
+
+@pytest.mark.parametrize(
+    ("shape", "principal"),
+    [
+        ({"type": "sphere", "radius": 2.0}, (0.5, 0.5)),
+        ({"type": "sphere", "radius": 2.0, "flip_normals": True}, (-0.5, -0.5)),
+        ({"type": "cylinder", "radius": 2.0, "p0": [0, 0, -1], "p1": [0, 0, 1]}, (0.0, 0.5)),
+        ("mesh", (2 * np.pi / 13, 2 * np.pi / 13)),
+        ({"type": "rectangle", "to_world": [0, 1, 0]}, (0.0, 0.0)),
+    ],
+)
+def test_curvature_is_that_of_the_shape(shape: Any, principal: tuple[float, float]) -> None:
+    """Principal curvatures; a unit of uv of the other shapes is measured here."""
+    if shape == "mesh":
+        shape = Chart("sphere", 13, 1.0).mesh(None, {"type": "diffuse"}, 16)
+    elif shape["type"] == "rectangle":
+        shape = shape | {"to_world": mi.ScalarTransform4f().rotate([0, 1, 0], -90)}
+    scene = mi.load_dict({"type": "scene", "shape": shape})
+    si = with_normal_partials(hits(scene))
+    unit = np.sqrt(np.linalg.norm(np.cross(np.array(si.dp_du).T, np.array(si.dp_dv).T), axis=1))
+    xx, xy, yy = (np.array(x) / unit for x in curvature(si, mi.Float(1.0)))
+    matrices = np.moveaxis(np.array([[xx, xy], [xy, yy]]), -1, 0)
+    np.testing.assert_allclose(np.linalg.eigvalsh(matrices), np.tile(sorted(principal), (64, 1)), atol=0.01)
+
+
+def test_the_form_turns_with_the_frame() -> None:
+    angle, hand, form = 0.7, -1.0, np.array([[0.3, -0.2], [-0.2, 0.9]])
+    c, s = np.cos(angle), np.sin(angle)
+    turn = np.array([[c, s], [-hand * s, hand * c]])
+    found = rotated((mi.Float(0.3), mi.Float(-0.2), mi.Float(0.9)), mi.Float(c), mi.Float(s), mi.Float(hand))
+    expected = (turn @ form @ turn.T)[[0, 0, 1], [0, 1, 1]]
+    np.testing.assert_allclose(np.array(found).ravel(), expected, atol=1e-6)
+
+
+def test_tilting_back_is_the_inverse() -> None:
+    w = np.random.default_rng(0).standard_normal((3, 50))
+    w /= np.linalg.norm(w, axis=0)
+    tilt = mi.Vector2f(0.3, -0.5)
+    there = tilted(mi.Vector3f(w.astype(np.float32)), tilt)
+    np.testing.assert_allclose(np.array(tilted(there, tilt, back=True)), w, atol=1e-6)
+    normal = np.array(tilted(mi.Vector3f(0, 0, 1), tilt, back=True)).ravel()
+    angle = np.hypot(0.3, 0.5)
+    np.testing.assert_allclose(
+        normal, [*np.array([0.3, -0.5]) / angle * np.sin(angle), np.cos(angle)], atol=1e-6
+    )
+
+
+def heights_at(z: F64, x: F64, y: F64) -> F64:
+    """Heights of the triangles over places (x, y); row index of z along +y."""
+    px, py = x * z.shape[1] - 0.5, y * z.shape[0] - 0.5
+    i, j = np.floor(px).astype(int), np.floor(py).astype(int)
+    fx, fy = px - i, py - j
+    a, b, c, d = (z[(j + k) % z.shape[0], (i + h) % z.shape[1]] for k in (0, 1) for h in (0, 1))
+    return a + (b - a) * fx + (c - a) * fy + (d - b - c + a) * np.maximum(0, fx + fy - 1)
+
+
+@pytest.mark.parametrize("kappa", [0.2, 1.0, -0.5])
+@pytest.mark.parametrize("inside", [False, True])
+def test_rays_over_a_sphere_meet_what_small_steps_find(kappa: float, inside: bool) -> None:
+    """View rays from the top of the shell, and light that leaves from within, stepped over the sphere."""
+    n, steps, random = 300, 8000, np.random.default_rng(3)
+    z = rough_heights(16, 16, DEPTH).astype(np.float64)
+    heightfield = HeightField.of(z, 1.0, 1.0, False)
+    z = z[::-1]
+    up, azimuth = random.uniform(-0.2 if inside else 0.05, 0.95, n), random.uniform(0, 2 * np.pi, n)
+    if not inside:
+        up = -up
+    flat, (u, v) = np.sqrt(1 - up**2), random.random((2, n))
+    d = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up])
+    start = np.minimum(heights_at(z, u, v) + 0.03, 0.0) if inside else np.zeros(n)
+    form = mi.Vector3f(kappa, 0.0, kappa)
+    arc = Arc.of(mi.Vector3f(d.astype(np.float32)), form, mi.Float(DEPTH), 64.0, mi.Float(start))
+    hit, s, height = (np.array(x) for x in trace_arcs(heightfield, mi.Point2f(u, v), arc, 1.0, mi.Bool(True)))
+    # From the center of the sphere: along the normal of the start, and along the azimuth.
+    radius = 1.0 / kappa
+    t = np.linspace(0, 1, steps + 1)[1:, None] * 4.0
+    along, across = radius + start + t * up, t * flat
+    r = np.sign(kappa) * np.hypot(along, across)
+    position = radius * np.arctan2(np.sign(kappa) * across, np.sign(kappa) * along)
+    ground = heights_at(z, u + position * np.cos(azimuth), v + position * np.sin(azimuth))
+    below = r - radius <= ground
+    gone = np.logical_or.accumulate(r - radius > 1e-9, axis=0)
+    expected = (below & ~gone).any(0)
+    first = np.argmax(below & ~gone, axis=0)
+    assert np.mean(hit == expected) > 0.99
+    both = hit & expected
+    assert both.mean() > 0.1
+    lanes = np.arange(n)
+    for found, exact in ((s, position), (height, r - radius)):
+        assert np.quantile(np.abs(found - exact[first, lanes])[both], 0.95) < 3e-3
+
+
+def test_a_plane_looks_as_without_silhouettes(tmp_path: Path) -> None:
+    """Bit for bit."""
+    write_material(tmp_path, model="relief", finest=3)
+    found = []
+    for silhouettes in (False, True):
+        bsdf = {"type": "mbtf", "material": str(tmp_path), "silhouettes": silhouettes}
+        scene = load_scene({"type": "scene", "plane": plane(bsdf)})
+        random = np.random.default_rng(1).uniform(-1, 1, (5, 4000)).astype(np.float32)
+        towards = mi.Vector3f(mi.Float(random[0]), mi.Float(random[1]), mi.Float(0.05 + abs(random[2])))
+        ray = mi.Ray3f(mi.Point3f(mi.Float(random[3]), mi.Float(random[4]), 0.0) + towards, -towards)
+        si = scene.ray_intersect(ray)
+        wo = mi.warp.square_to_uniform_hemisphere(0.5 * mi.Point2f(random[:2]) + 0.5)
+        value, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, wo)
+        found.append((np.array(value), np.array(pdf)))
+    assert found[0][0].max() > 0
+    for flat, curved in zip(*found, strict=True):
+        np.testing.assert_array_equal(flat, curved)
+
+
+def test_a_material_without_heights_has_no_silhouettes(tmp_path: Path) -> None:
+    write_material(tmp_path, model="neumip", finest=2)
+    with pytest.raises(UsageError, match="knows no heights"):
+        load_scene({"type": "mbtf", "material": str(tmp_path), "silhouettes": True})
+    with pytest.raises(UsageError, match="true or false"):
+        load_scene({"type": "mbtf", "material": str(tmp_path), "silhouettes": "false"})
+
+
+@pytest.mark.parametrize("integrator", ["path", "mbtf_path"])
+def test_a_flat_tile_in_a_furnace_keeps_its_energy(integrator: str, tmp_path: Path) -> None:
+    """On a sphere it is opaque, and as bright as on a plane."""
+    write_material(tmp_path, model="relief", constant=(0.2,) * 3, finest=2)
+    bsdf = {"type": "mbtf", "material": str(tmp_path), "uv_scale": 8.0, "silhouettes": True}
+    sensor = {
+        "type": "perspective",
+        "fov": 20,
+        "to_world": mi.ScalarTransform4f().look_at([0, -4, 1], [0, 0, 0], [0, 0, 1]),
+        "film": {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb"},
+    }
+    ball = {"type": "sphere", "bsdf": bsdf}
+    scene = mi.load_dict({"type": "scene", "s": sensor, "b": ball, "e": {"type": "constant"}})
+    picture = mi.render(scene, integrator=mi.load_dict({"type": integrator, "max_depth": 6}), spp=128)
+    assert float(np.array(picture).mean()) == pytest.approx(0.2 * np.pi, rel=0.005)
