@@ -15,8 +15,8 @@ from mbtf_fit.backends.mitsuba.backend import MITSUBA, Arithmetic, Loader, Numbe
 from mbtf_fit.backends.mitsuba.stored_material import F32, StoredMaterial
 from mbtf_fit.backends.mitsuba.textures import Textures
 from mbtf_fit.material.format import DESCRIPTION_NAME
-from mbtf_fit.ops import Operation, Shade, Trace, sizes_of, stages
-from mbtf_fit.ops.operation import output_names
+from mbtf_fit.ops import Gate, Operation, Shade, Trace, sizes_of, stages
+from mbtf_fit.ops.operation import output_names, parse
 from mbtf_gen.engine.types import Color3f, Float, Point2f, Vector3f
 
 # Values by name.
@@ -58,6 +58,7 @@ class Evaluator:
         self.shell = None if trace is None else lookup.shell_of(trace, loader)
         first, second = ([(op, MITSUBA[op](op, loader)) for op in part] for part in stages(stored.operations))
         self._first, self._second, self._last = first, second, stored.operations[-1].output
+        self._core = _core(stored.operations)
         self._coefficients = None if stored.transmittance is None else Textures(stored.transmittance)
 
     def level(self, sigma: Float) -> Float:
@@ -76,7 +77,13 @@ class Evaluator:
 
     def value(self, values: Values, omega_i: Vector3f, lit: shade.DirectLight | None = None) -> Color3f:
         """The value in 1/sr, at least 0, of values of stage 1."""
-        return dr.maximum(mi.Color3f(*self.stage2(values, omega_i, lit)[self._last]), 0.0)
+        found = self.stage2(values, omega_i, lit)
+        value = mi.Color3f(*found[self._last])
+        if lit is not None and self._core is not None:
+            # Of light below that of the data the network knows nothing, and its hints grow without bounds.
+            name, part = self._core
+            value = dr.lerp(mi.Color3f(*found[name][part]), value, lit.known)
+        return dr.maximum(value, 0.0)
 
     def transmittance(self, u: Point2f, level: Float, omega_o: Vector3f) -> Float:
         """Transparent fraction of the footprint for unit vectors on either side of the plane, equal for
@@ -110,6 +117,15 @@ class Evaluator:
         values = self.stage1(position, self.level(mi.Float(np.asarray(sigma, np.float32))), views)
         out: F32 = np.array(self.value(values, lights), np.float32).T
         return out
+
+
+def _core(operations: Sequence[Operation]) -> tuple[str, slice] | None:
+    """Where the single scattering is that the last operation scales; None if it scales none."""
+    last = operations[-1]
+    if not isinstance(last, Gate):
+        return None
+    name, part = parse(last.x)
+    return (name, part) if any(isinstance(op, Shade) and op.output == name for op in operations) else None
 
 
 def _run(

@@ -50,6 +50,11 @@ class DirectLight:
     least: Float
     flat: Mask
 
+    @property
+    def known(self) -> Float:
+        """1 where the data have such light, 0 where it comes from below the plane."""
+        return dr.select(self.flat, 1.0, dr.clip(self.omega_i.z / self.least, 0.0, 1.0))
+
     def light(self, horizon: Float, place: int) -> Float:
         """Light at a place by the visibility of horizons, which knows the footprint and of which curvature
         changes some. Light below that of the data has been traced alone."""

@@ -17,7 +17,10 @@ from mbtf_core.errors import UsageError
 from mbtf_fit.backends.mitsuba import load_scene
 from mbtf_fit.backends.mitsuba.arcs import Arc, trace_arcs
 from mbtf_fit.backends.mitsuba.curvature import curvature, rotated, with_normal_partials
+from mbtf_fit.backends.mitsuba.evaluator import Evaluator
+from mbtf_fit.backends.mitsuba.shade import DirectLight
 from mbtf_fit.backends.mitsuba.shell import tilted
+from mbtf_fit.backends.mitsuba.stored_material import read_material
 from mbtf_gen.pictures.shapes import Chart
 from mbtf_gen.tile.tracers.heightfield import HeightField
 
@@ -140,6 +143,22 @@ def test_a_plane_looks_as_without_silhouettes(tmp_path: Path) -> None:
     assert found[0][0].max() > 0
     for flat, curved in zip(*found, strict=True):
         np.testing.assert_array_equal(flat, curved)
+
+
+def test_light_from_below_the_plane_is_scattered_once(tmp_path: Path) -> None:
+    """Whatever the network says, which saw no such light."""
+    found = []
+    for brightness in (0.3, 3.0):
+        write_material(tmp_path / str(brightness), model="relief", finest=3, brightness=brightness)
+        evaluator = Evaluator(read_material(tmp_path / str(brightness)))
+        values = evaluator.stage1(mi.Point2f(0.2, 0.7), mi.Float(2.0), mi.Vector3f(0.0, 0.6, 0.8))
+        for z in (-0.2, 0.1):
+            light = mi.Vector3f(float(np.sqrt(1 - z**2)), 0.0, z)
+            lit = DirectLight([(mi.Float(1.0),) * 2], light, mi.Float(0.1), mi.Float(0.1), mi.Bool(False))
+            found.append(np.array(evaluator.value(values, mi.Vector3f(float(np.sqrt(0.99)), 0.0, 0.1), lit)))
+    assert found[0].min() > 0
+    np.testing.assert_array_equal(found[0], found[2])
+    assert (abs(found[1] - found[3]) > 0.01).all()
 
 
 def test_a_material_without_heights_has_no_silhouettes(tmp_path: Path) -> None:
