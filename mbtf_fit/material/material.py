@@ -228,7 +228,8 @@ class Material:
         Returns
         -------
         (..., 2) float32 array
-            Offsets along u and v in tile widths; zero for a model without offset.
+            Offsets along u and v in tile widths at the finest level; zero for a model without offset, or
+            with one that depends on the light.
 
         Raises
         ------

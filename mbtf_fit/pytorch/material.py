@@ -178,14 +178,16 @@ class NeuralMaterial(nn.Module):
 
     def offset(self, u: Tensor, omega_o: Tensor) -> Tensor:
         """Displacement of the lookup at the finest footprint, (n, 2) in tile widths: the neural offset, or
-        that of the surface point that is seen; zero for a model without."""
+        that of the surface point that is seen; zero for a model without, or where it depends on the light."""
         if any(isinstance(op, ops.Trace) for op in self._own):
             height = self.known.tracer.trace(u, omega_o)[:, None]
             return height * omega_o[:, :2] / omega_o[:, 2:]
-        op = next((o for o in self._own if isinstance(o, ops.Offset)), None)
+        first, _ = ops.stages(self._own)
+        op = next((o for o in first if isinstance(o, ops.Offset)), None)
         if op is None:
             return torch.zeros_like(u)
-        given = {"u": u, "omega_o": omega_o, op.u: u}
+        level = u.new_full((len(u),), float(self.lattice.finest))
+        given = {"u": u, "level": level, "omega_o": omega_o, op.u: u}
         return displacement(op, self.run([op.r], given)[0], omega_o)
 
     def level(self, sigma: Tensor) -> Tensor:

@@ -108,6 +108,9 @@ _EARLY_STEPS, _LAW_SCATTER = 50.0, 0.1
 _LASTING, _LASTING_SCATTER = 0.5, 0.05
 # Unexplained variance that noise leaves, over the noise-to-signal ratio per query of a texel.
 _NOISE_ERROR = 6.0
+# Expected remainder of the error below which a fit counts as not converged, and the steps from which the
+# curve is believed.
+_STEEP, _LAW_STEPS = 0.8, 100
 # Below so many steps, twice the steps reduce the error by a tenth or more: in the mean over seven materials
 # to 0.84 of it after 200 steps, to 0.92 after 400.
 FEWEST_STEPS = 400
@@ -115,13 +118,6 @@ FEWEST_STEPS = 400
 FLAT = 0.95
 # Relative standard error of the validation above which it does not tell convergence.
 _RESOLVED = 0.25
-
-
-def caveat(steps: int, unexplained: Mapping[str, Any]) -> str:
-    """Why the error of a fit does not rank its model: few steps, or an unexplained variance above 1; empty
-    where it does."""
-    few = [f"{steps} steps: not converged"] if steps < FEWEST_STEPS else []
-    return ", ".join([*few, *above_one(unexplained)])
 
 
 @dataclass(frozen=True)
@@ -179,6 +175,24 @@ def marginal_cost_of(
     doubling = None if doubling is None else doubling ** (1.0 - limit)
     kept = kept_step(training)
     return MarginalCost(doubling, share, int(last["step"]), error, kept, ratio, density, limit)
+
+
+def caveat(history: list[dict[str, Any]], training: Mapping[str, Any], unexplained: Mapping[str, Any]) -> str:
+    """Why the error of a fit does not rank its model; empty where it does.
+
+    Its error still falls steeply, or it has few steps where the history does not tell; or the unexplained
+    variance is above 1.
+
+    Parameters
+    ----------
+    history : records of the fit's validations
+    training : record of its training
+    unexplained : variance on test queries, value and error
+    """
+    steps, cost = training["steps"], marginal_cost_of(history, {}, training)
+    doubling = None if cost is None or steps < _LAW_STEPS else cost.doubling
+    falls = steps < FEWEST_STEPS if doubling is None else doubling < _STEEP
+    return ", ".join([*([f"{steps} steps: not converged"] if falls else []), *above_one(unexplained)])
 
 
 def _doubling(history: list[dict[str, Any]]) -> float | None:

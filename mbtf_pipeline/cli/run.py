@@ -237,8 +237,9 @@ def _report(
     for fit, record in result.comparison["test"].items():
         errors, history = record["splits"]["test"], read_history(folder / FITS / fit)
         ending = describe_ending(recipe.fit[fit], history)
-        step = suggest(Material.load(folder / FITS / fit), history, record["splits"])
-        why = caveat(record["training_steps"], errors["unexplained"])
+        material = Material.load(folder / FITS / fit)
+        step = suggest(material, history, record["splits"])
+        why = caveat(history, material.description["training"], errors["unexplained"])
         fits[fit] = {
             "unexplained_variance": errors["unexplained"],
             "mse": errors["mse"],

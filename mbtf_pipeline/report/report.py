@@ -30,7 +30,7 @@ from mbtf_pipeline.report.sections import (
 from mbtf_pipeline.stages import COMPARE, FITS, REPORT, RUN, SHARDS, VIEWER
 
 # Raised when the report or the viewer's page changes; part of the stage's key.
-LAYOUT = 18
+LAYOUT = 19
 # Path-traced pictures in the viewer's page.
 _MOST_PICTURES = 4
 
@@ -74,6 +74,7 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
     gallery: Gallery = {}
     shown = picture_section(folder / COMPARE, comparison, exposure, gallery)
     fit_folders = {name: folder / FITS / name for name in comparison["fits"]}
+    training = training_context(fit_folders)
     context: dict[str, Any] = {
         "title": recipe.title,
         "comparison": comparison,
@@ -86,8 +87,8 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
         "command": run["command"],
         "recipe_yaml": read_document(folder / RECIPE_NAME),
         "provenance": provenance(folder, manifest, comparison["fits"], run["machine"]),
-        **error_context(comparison),
-        **training_context(fit_folders),
+        **error_context(comparison, training),
+        **training,
         "time_tables": time_tables(folder, stages, comparison),
         "exposure": describe_exposure(exposure),
     }

@@ -32,25 +32,28 @@ _GROUPINGS = (
 _THUMBNAIL = 192
 
 
-def error_context(comparison: Mapping[str, Any]) -> dict[str, Any]:
-    """Data about errors."""
+def error_context(comparison: Mapping[str, Any], training: Mapping[str, Any]) -> dict[str, Any]:
+    """Data about errors; `training` is that of :func:`training_context`."""
     tests = {fit: record["splits"]["test"] for fit, record in comparison["test"].items()}
+    titles = {fit: _with_caveat(fit, errors["unexplained"], training) for fit, errors in tests.items()}
     groupings = [shown for grouping in _GROUPINGS if (shown := _grouping(tests, *grouping)) is not None]
     return {
-        "facts": _facts(comparison, tests),
+        "facts": _facts(comparison, tests, titles),
         "ranking": _ranking(comparison),
         "test": next(iter(tests.values())),
-        "error_table": _error_table(comparison),
+        "error_table": _error_table(comparison, titles),
         "error_plots": [shown for shown, _ in groupings],
         "group_tables": [table for _, table in groupings],
     }
 
 
-def _facts(comparison: Mapping[str, Any], tests: Mapping[str, Any]) -> list[dict[str, str]]:
+def _facts(
+    comparison: Mapping[str, Any], tests: Mapping[str, Any], titles: Mapping[str, str]
+) -> list[dict[str, str]]:
     fit, out = comparison["fits"][0], []
     for name, errors in tests.items():
         equal = "" if _differs(comparison, name) else f"; difference from {fit} {NOT_SIGNIFICANT}"
-        what = f"{UNEXPLAINED} of {_with_caveat(name, comparison)}{equal}"
+        what = f"{UNEXPLAINED} of {titles[name]}{equal}"
         out.append({"value": data_errors(errors)[0], "what": what})
     records = [p["fits"][fit] for p in comparison["pictures"]]
     decibels = [r["errors"][comparison["kinds"][0]]["psnr"]["value"] for r in records]
@@ -66,12 +69,11 @@ def _facts(comparison: Mapping[str, Any], tests: Mapping[str, Any]) -> list[dict
     return out
 
 
-def _with_caveat(fit: str, comparison: Mapping[str, Any]) -> str:
+def _with_caveat(fit: str, unexplained: Mapping[str, Any], training: Mapping[str, Any]) -> str:
     """The name of a fit, and why its error does not rank its model."""
     from mbtf_fit.training.validation import caveat
 
-    record = comparison["test"][fit]
-    text = caveat(record["training_steps"], record["splits"]["test"]["unexplained"])
+    text = caveat(training["histories"][fit], training["trainings"][fit], unexplained)
     return f"{fit} ({text})" if text else fit
 
 
@@ -109,7 +111,7 @@ def _ranking(comparison: Mapping[str, Any]) -> str:
     )
 
 
-def _error_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
+def _error_table(comparison: Mapping[str, Any], titles: Mapping[str, str]) -> dict[str, Any]:
     splits = list(next(iter(comparison["test"].values()))["splits"])
     errors = [f"{UNEXPLAINED}, {SPLIT_NAMES[s]}" for s in splits]
     rows = []
@@ -117,9 +119,7 @@ def _error_table(comparison: Mapping[str, Any]) -> dict[str, Any]:
         cells = [data_errors(record["splits"][s])[0] if s in record["splits"] else "–" for s in splits]
         mse = data_errors(record["splits"]["test"])[1]
         cells += [mse, f"{record['training_steps']:,}", f"{record['training_seconds']:.0f}"]
-        rows.append(
-            [_with_caveat(fit, comparison), *cells, f"{record['network_weights']:,}", f"{record['texels']:,}"]
-        )
+        rows.append([titles[fit], *cells, f"{record['network_weights']:,}", f"{record['texels']:,}"])
     head = ["fit", *errors, "MSE, test [10⁻³/sr²]", "training steps", "training [s]"]
     head += ["network weights", "texture values"]
     return {"head": head, "rows": rows}
@@ -186,7 +186,7 @@ def training_context(fits: Mapping[str, Path]) -> dict[str, Any]:
         if series:
             plots.append({"title": title, "svg": plot(series, "seconds of training", y, label, log="y")})
     trainings = {name: Material.load(folder).description["training"] for name, folder in fits.items()}
-    return {"training_plots": plots, "trainings": trainings}
+    return {"training_plots": plots, "trainings": trainings, "histories": histories}
 
 
 def time_tables(folder: Path, stages: Sequence[str], comparison: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -47,7 +47,7 @@ TOLERANCE = {"unrolled": 1e-4, "cooperative": 1e-4, "half": 1e-2}
 # One conformance query of so many may deviate where view rays are traced.
 MISSED_EDGES = 100
 
-PARAMETERS = ("material", "uv_scale", "sigma", "networks", "sampling", "silhouettes")
+PARAMETERS = ("material", "uv_scale", "sigma", "networks", "sampling", "silhouettes", "two_sided")
 
 _log = logging.getLogger(__name__)
 # Materials with a warning of missing footprints.
@@ -57,26 +57,31 @@ _warned: set[Path] = set()
 @dataclass(frozen=True)
 class Frame:
     """The tile's frame at hits: the shading frame, rotated about the normal by an angle of cosine c and sine
-    s, and reflected where hand is -1; then tilted, over a curved surface."""
+    s, and reflected where hand is -1; upside down where side is -1; then tilted, over a curved surface."""
 
     c: Float
     s: Float
     hand: Float
+    side: Float
     tilt: Vector2f | None = None
 
     @classmethod
-    def at(cls, si: SurfaceInteraction3f) -> Frame:
-        """x along ∂p/∂u, y towards decreasing v of Mitsuba (images have row 0 there at v = 0)."""
+    def at(cls, si: SurfaceInteraction3f, two_sided: bool = False) -> Frame:
+        """x along ∂p/∂u, y towards decreasing v of Mitsuba (images have row 0 there at v = 0), z towards the
+        viewer where the surface is two-sided."""
         du, dv = si.sh_frame.to_local(si.dp_du), si.sh_frame.to_local(si.dp_dv)
         length = dr.sqrt(dr.fma(du.x, du.x, du.y * du.y))
         good = length > 0
         hand = dr.select(du.x * dv.y - du.y * dv.x > 0, mi.Float(-1.0), 1.0)
-        return cls(dr.select(good, du.x / length, 1.0), dr.select(good, du.y / length, 0.0), hand)
+        side = dr.select(si.wi.z < 0, mi.Float(-1.0), 1.0) if two_sided else mi.Float(1.0)
+        return cls(dr.select(good, du.x / length, 1.0), dr.select(good, du.y / length, 0.0), hand, side)
 
     def to_tile(self, w: Vector3f) -> Vector3f:
         """Local direction → the tile's."""
         w = mi.Vector3f(
-            dr.fma(self.c, w.x, self.s * w.y), self.hand * dr.fma(self.c, w.y, -self.s * w.x), w.z
+            dr.fma(self.c, w.x, self.s * w.y),
+            self.hand * dr.fma(self.c, w.y, -self.s * w.x),
+            self.side * w.z,
         )
         return w if self.tilt is None else tilted(w, self.tilt)
 
@@ -85,7 +90,7 @@ class Frame:
         if self.tilt is not None:
             w = tilted(w, self.tilt, back=True)
         y = self.hand * w.y
-        return mi.Vector3f(dr.fma(self.c, w.x, -self.s * y), dr.fma(self.s, w.x, self.c * y), w.z)
+        return mi.Vector3f(dr.fma(self.c, w.x, -self.s * y), dr.fma(self.s, w.x, self.c * y), self.side * w.z)
 
 
 class MbtfBSDF(mi.BSDF):
@@ -101,6 +106,7 @@ class MbtfBSDF(mi.BSDF):
     sampling : ``lobes`` (default) or ``cosine``
     silhouettes : whether heights are traced over the curved surface, which is their top, and rays that miss
         them pass through the shape (default false)
+    two_sided : whether the back looks as the front, mirrored at the surface (default false)
 
     Raises
     ------
@@ -125,10 +131,10 @@ class MbtfBSDF(mi.BSDF):
         if self._choice(props, "sampling", ("lobes", "cosine")) != "cosine":
             # Cooperative kernels do not depend on the material: they are compiled once.
             self.lobes = LobeTextures(fit_lobes(Evaluator(stored, "cooperative")))
-        silhouettes = props.get("silhouettes", False)
-        if not isinstance(silhouettes, bool):
-            what = f"silhouettes must be true or false, not {silhouettes}"
-            raise UsageError(what, where=self._name(props))
+        silhouettes, self.two_sided = self._switch(props, "silhouettes"), self._switch(props, "two_sided")
+        if silhouettes and self.two_sided:
+            hint = "silhouettes trace the front alone: leave one of them out"
+            raise UsageError("has both silhouettes and two_sided", where=self._name(props), hint=hint)
         self.shell = self.evaluator.shell if silhouettes else None
         if silhouettes and self.shell is None:
             raise UsageError(
@@ -143,6 +149,8 @@ class MbtfBSDF(mi.BSDF):
         super().__init__(props)
         known = mi.BSDFFlags
         self.m_flags = known.GlossyReflection | known.FrontSide | known.SpatiallyVarying | known.Anisotropic
+        if self.two_sided:
+            self.m_flags |= known.BackSide
         self.m_components = [self.m_flags]
         self.transmits = self.shell is not None or stored.transmittance is not None
         if self.transmits:
@@ -153,6 +161,12 @@ class MbtfBSDF(mi.BSDF):
     @staticmethod
     def _name(props: Properties) -> str:
         return f"{BSDF_NAME} '{props.id()}'" if props.id() else BSDF_NAME
+
+    def _switch(self, props: Properties, name: str) -> bool:
+        value = props.get(name, False)
+        if not isinstance(value, bool):
+            raise UsageError(f"{name} must be true or false, not {value}", where=self._name(props))
+        return value
 
     def _positive(self, props: Properties, name: str, default: float) -> Any:
         value = props.get(name, default)
@@ -203,7 +217,8 @@ class MbtfBSDF(mi.BSDF):
 
     def _view(self, si: SurfaceInteraction3f) -> View:
         self._warn_once()
-        frame, u, level = Frame.at(si), self.uv(si), self.evaluator.level(self.footprint(si))
+        frame, u = Frame.at(si, self.two_sided), self.uv(si)
+        level = self.evaluator.level(self.footprint(si))
         wi = frame.to_tile(si.wi)
         if self.shell is None:
             return View(self, frame, u, level, wi, wi.z > 0)
@@ -297,7 +312,9 @@ class View:
 
     def transmittance(self) -> Float:
         """Transparent fraction of the footprint."""
-        found = self.bsdf.evaluator.transmittance(self.u, self.level, self.wi)
+        # Along the ray itself, not its mirror image: rays to and fro pass the same holes.
+        ray = mi.Vector3f(self.wi.x, self.wi.y, self.frame.side * self.wi.z)
+        found = self.bsdf.evaluator.transmittance(self.u, self.level, ray)
         if self.hit is None:
             return found
         # Rays pass the back of a shape where they leave its shell, not its inside.

@@ -72,14 +72,33 @@ def test_the_plugin_evaluates_the_fitted_transmittance(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.array(evaluator.transmittance(u, level, -view)), wanted, atol=2e-4)
 
 
+def test_rays_to_and_fro_pass_the_same_holes(tmp_path: Path) -> None:
+    """Those of a two-sided surface are slanted alike for both of its sides."""
+    random = np.random.default_rng(2)
+    lattice = Lattice(2)
+    levels = [random.normal(0.3, 0.2, (*lattice.shape(s), 6)).astype(np.float32) for s in range(3)]
+    write_material(tmp_path, finest=2, transmittance=Transmittance(lattice, levels))
+    own = {"material": str(tmp_path), "networks": "cooperative", "sampling": "cosine", "two_sided": True}
+    bsdf = mi.load_dict({"type": "mbtf", **own})
+    there, back = (
+        interaction(64, (x, 2 * x, z), uv=mi.Point2f(0.3, 0.6)) for x, z in ((0.3, 0.5), (-0.3, -0.5))
+    )
+    passed = [np.array(bsdf.eval_null_transmission(si)) for si in (there, back)]
+    assert 0.05 < passed[0].mean() < 0.95
+    np.testing.assert_allclose(*passed, rtol=1e-5)
+
+
 @pytest.mark.parametrize("lace", ["neumip"], indirect=True)
 @pytest.mark.parametrize("integrator", ["path", "mbtf_path"])
-@pytest.mark.parametrize(("elevation", "reflected"), [(50.0, np.pi * GRAY), (-50.0, 0.0)])
+@pytest.mark.parametrize(
+    ("elevation", "two_sided", "reflected"),
+    [(50.0, False, np.pi * GRAY), (-50.0, False, 0.0), (-50.0, True, np.pi * GRAY)],
+)
 def test_a_sheet_in_a_furnace_conserves_energy(
-    integrator: str, elevation: float, reflected: float, lace: dict[str, Any]
+    integrator: str, elevation: float, two_sided: bool, reflected: float, lace: dict[str, Any]
 ) -> None:
-    """From below it reflects nothing and transmits as much as from above."""
-    seen = render(integrator, elevation, m=plane(lace), e={"type": "constant"})
+    """From below it transmits as much as from above, and reflects nothing unless it is two-sided."""
+    seen = render(integrator, elevation, m=plane(lace | {"two_sided": two_sided}), e={"type": "constant"})
     assert seen == pytest.approx(reflected + SHARE, abs=0.012)
 
 

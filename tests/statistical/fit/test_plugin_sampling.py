@@ -129,13 +129,16 @@ def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     return out
 
 
-def test_weights_are_value_over_density_of_the_same_directions(folder: Path) -> None:
-    """sample, eval, pdf and eval_pdf of the plugin agree, and its samples pass χ² through a turned frame."""
-    bsdf = mi.load_dict({"type": "mbtf", "material": str(folder), "networks": "cooperative"})
+@pytest.mark.parametrize("side", [1, -1])
+def test_weights_are_value_over_density_of_the_same_directions(side: int, folder: Path) -> None:
+    """sample, eval, pdf and eval_pdf of the plugin agree, and its samples pass χ² through a turned frame, at
+    the back of a two-sided surface too."""
+    own = {"material": str(folder), "networks": "cooperative", "two_sided": side < 0}
+    bsdf = mi.load_dict({"type": "mbtf", **own})
     n = 100_000
     partials = {"dp_du": mi.Vector3f(0.6, 0.8, 0), "dp_dv": mi.Vector3f(0.8, -0.3, 0)}
     pixel = {"duv_dx": mi.Vector2f(0.1, 0.02), "duv_dy": mi.Vector2f(0.01, 0.3)}
-    si = interaction(n, (0.5, 0.4, 0.5), uv=mi.Point2f(0.3, 1.7), **partials, **pixel)
+    si = interaction(n, (0.5, 0.4, side * 0.5), uv=mi.Point2f(0.3, 1.7), **partials, **pixel)
     context = mi.BSDFContext()
     bs, weight = bsdf.sample(context, si, *uniform(n, 3))
     kept = np.array(bs.pdf) > 0
@@ -153,8 +156,9 @@ def test_weights_are_value_over_density_of_the_same_directions(folder: Path) -> 
         hit = dr.gather(mi.SurfaceInteraction3f, si, dr.zeros(mi.UInt32, len(w)))
         return np.array(bsdf.pdf(context, hit, mi.Vector3f(w.T.astype(np.float32))), np.float64)
 
-    wo = np.where(kept, np.array(bs.wo), np.array([[0.0], [0.0], [-1.0]])).T
-    assert chi_square_test(wo, density, Cap(cos_min=0.0), bins=(12, 24)).p_value > 1e-3
+    wo = np.where(kept, np.array(bs.wo), np.array([[0.0], [0.0], [-side]])).T
+    half = Cap((0.0, 0.0, side), cos_min=0.0)
+    assert chi_square_test(wo, density, half, bins=(12, 24)).p_value > 1e-3
 
 
 def film(size: int) -> dict[str, Any]:

@@ -167,6 +167,8 @@ def test_a_material_without_heights_has_no_silhouettes(tmp_path: Path) -> None:
         load_scene({"type": "mbtf", "material": str(tmp_path), "silhouettes": True})
     with pytest.raises(UsageError, match="true or false"):
         load_scene({"type": "mbtf", "material": str(tmp_path), "silhouettes": "false"})
+    with pytest.raises(UsageError, match="both silhouettes and two_sided"):
+        load_scene({"type": "mbtf", "material": str(tmp_path), "silhouettes": True, "two_sided": True})
 
 
 @pytest.mark.parametrize("integrator", ["path", "mbtf_path"])

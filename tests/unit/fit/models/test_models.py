@@ -11,7 +11,7 @@ from mbtf_core.config.settings import resolve
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import UsageError
 from mbtf_fit.config import FitConfig, build_model
-from mbtf_fit.ops import read_operations
+from mbtf_fit.ops import Lookup, Offset, read_operations
 from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.sections import OutputTransform
 
@@ -146,6 +146,25 @@ def test_the_offset_follows_the_papers_formula() -> None:
     straight = torch.tensor([[0.0, 0.0, 1.0]], dtype=F64).expand(50, 3)
     assert model.offset(u, straight).abs().max() == 0
     assert random_model("baseline").offset(u, omega_o).abs().max() == 0
+
+
+@pytest.mark.parametrize(("depth", "lit"), [("depth", False), ("omega_i[0:1]", True)])
+def test_an_offset_of_ones_own_is_that_of_the_finest_level(depth: str, lit: bool) -> None:
+    """Its depths may have levels; where it depends on the light, there is not one."""
+    operations = [
+        Lookup("depth", "u", "level", "depths", 1),
+        Offset("moved", "u", depth, "omega_o"),
+        Lookup("value", "moved", "level", "texels", 3),
+    ]
+    model = NeuralMaterial(LATTICE, operations).double()
+    for texture in model.textures():
+        torch.nn.init.normal_(texture.texels)
+    u, omega_o = torch.rand(50, 2, dtype=F64), directions(50)
+    found = model.offset(u, omega_o)
+    finest = torch.full((50,), float(LATTICE.finest), dtype=F64)
+    (moved,) = model.run(["moved"], {"u": u, "level": finest, "omega_o": omega_o, "omega_i": omega_o})
+    torch.testing.assert_close(found, torch.zeros_like(u) if lit else moved - u)
+    assert (moved - u).abs().max() > 0.01
 
 
 @variants

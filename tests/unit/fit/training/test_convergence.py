@@ -46,11 +46,32 @@ def cost(records: list[dict[str, Any]], errors: dict[str, Any], **training: Any)
 
 
 def test_fits_of_few_steps_or_large_errors_do_not_rank_models() -> None:
-    assert caveat(400, {"value": 0.99, "error": 0.0}) == ""
-    assert "not converged" in caveat(399, {"value": None, "error": None})
-    assert "worse than the mean value" in caveat(400, {"value": 1.5, "error": 0.0})
+    assert caveat([], {"steps": 400}, {"value": 0.99, "error": 0.0}) == ""
+    assert "not converged" in caveat([], {"steps": 399}, {"value": None, "error": None})
+    assert "worse than the mean value" in caveat([], {"steps": 400}, {"value": 1.5, "error": 0.0})
     # Where the error may as well lie below 1, nothing is said.
-    assert caveat(400, {"value": 1.5, "error": 0.3}) == ""
+    assert caveat([], {"steps": 400}, {"value": 1.5, "error": 0.3}) == ""
+
+
+@pytest.mark.parametrize(
+    ("steps", "power", "error", "marked"),
+    [
+        # From 3.27 half-way to 0.466: twice the time left 0.75 of it.
+        (473, 2.8, 1e-3, True),
+        (473, 0.05, 1e-3, False),
+        (365, 0.05, 1e-3, False),
+        (4000, 1.0, 1e-3, True),
+        # The curve is not resolved, or hardly begun.
+        (365, 0.05, 0.4, True),
+        (473, 2.8, 0.4, False),
+        (40, 0.0, 1e-3, True),
+    ],
+)
+def test_a_fit_whose_error_still_falls_is_not_converged(
+    steps: int, power: float, error: float, marked: bool
+) -> None:
+    found = caveat(history(power, error, steps), {"steps": steps}, {"value": 0.2, "error": 0.002})
+    assert ("not converged" in found) == marked
 
 
 @pytest.mark.parametrize("power", [0.2, 0.4, 0.8])
