@@ -10,9 +10,8 @@ fit expects is followed, on test queries of 256 paths, three quarters of them dr
   factor, within 1.5;
 - ``flat``, hardly any reduction: right if twice the steps leave 0.8 or more;
 - ``few`` and ``none`` without a factor, where the error is too uncertain: the former is right if it falls;
-- ``data``, about 0.7 of it with twice the queries: as ``more``, at equal steps, after 800 steps;
-- ``most``, at most 0.7 of it with twice the queries, of a fit that has returned to an earlier state: right if
-  the factor is no larger. It has no other sentence.
+- ``data``, about 0.7 of it with twice the queries: as ``more``, at equal steps, after 800 steps; the only
+  sentence of a fit that has returned to an earlier state.
 
 Two standard errors of both errors are allowed. Below, the factors of twice the steps are compared with
 those that would be said, by number of steps; this is what the constants of
@@ -59,7 +58,7 @@ WITHIN, FLAT, STANDARD_ERRORS = 1.5, 0.8, 2.0
 SHARE, DEVIATION, DEVIATION_FROM = 0.8, 0.1, 200
 
 
-Sentence = Literal["few", "more", "flat", "none", "data", "most"]
+Sentence = Literal["few", "more", "flat", "none", "data"]
 
 
 @dataclass(frozen=True)
@@ -117,9 +116,7 @@ def followed(before: dict[str, Any], after: dict[str, Any], kind: Sentence, said
     factor = after["value"] / before["value"]
     spread = STANDARD_ERRORS * math.hypot(after["error"] / after["value"], before["error"] / before["value"])
     low, high = factor * (1.0 - spread), factor * (1.0 + spread)
-    if kind == "most":
-        right = said is None or low <= said
-    elif kind == "flat":
+    if kind == "flat":
         right = high >= FLAT
     elif said is None:
         right = kind == "none" or low < 1.0
@@ -139,7 +136,7 @@ def sentence(cost: MarginalCost) -> Sentence:
 
 def shown(name: str, seed: int, steps: int, before: dict[str, Any], found: Followed) -> None:
     """Print one row."""
-    change = "queries" if found.kind in ("data", "most") else "steps"
+    change = "queries" if found.kind == "data" else "steps"
     said = "      " if found.said is None else f"x {found.said:.2f}"
     print(
         f"{name:12s} seed {seed} {steps:5d} steps  {before['value']:.4f} ± {before['error']:.4f}  "
@@ -180,8 +177,7 @@ def main() -> int:
         before = fitted(name, arguments.out, QUERIES_AT, 0)
         if (share := before["noise_share"]) is not None:
             after = fitted(name, arguments.out, QUERIES_AT, 0, twice=True)
-            kind: Sentence = "data" if before["kept"] is None else "most"
-            found.append(followed(before, after, kind, 1.0 - 0.5 * share))
+            found.append(followed(before, after, "data", 1.0 - 0.5 * share))
             shown(name, 0, QUERIES_AT, before, found[-1])
         spoken = [s for s in found if s.kind != "none"]
         shares[name] = sum(s.right for s in spoken) / max(1, len(spoken))

@@ -33,7 +33,7 @@ _SIGNIFICANT = 2.0
 
 def visibility(split: Mapping[str, Any]) -> tuple[str, str | None]:
     """PSNR as text, and a word of :data:`VISIBILITY`, of the errors of a split; where the error is below its
-    own uncertainty, bounds. None without an error, or where the bounds exclude nothing."""
+    own uncertainty, bounds. No word without an error, or where the bounds exclude none."""
     from mbtf_core.color import white_of
 
     mse, error = split["mse"]["value"], split["mse"]["error"]
@@ -47,9 +47,9 @@ def visibility(split: Mapping[str, Any]) -> tuple[str, str | None]:
     word = next(word for least, word in VISIBILITY if psnr >= least)
     if resolved or word == VISIBILITY[0][1]:
         return f"PSNR {'' if resolved else 'above '}{psnr:.1f} dB", word
-    if word == VISIBILITY[-1][1]:
+    if psnr <= 0.0:
         return "PSNR unknown", None
-    return f"PSNR above {psnr:.1f} dB", f"{word} at most"
+    return f"PSNR above {psnr:.1f} dB", f"{word} at most" if word != VISIBILITY[-1][1] else None
 
 
 def headline(errors: Mapping[str, Any]) -> str:
@@ -79,9 +79,9 @@ def report_errors(
         scale = unreliable(split) or "0: exact, 1: as good as the mean value"
         lines.append(f"unexplained variance {value} {of} ({scale})")
     text, word = visibility(split)
-    if word is not None:
-        shown = describe_exposure(split["exposure"])
-        lines.append(f"{text} {'' if lines else of + ' '}at {shown}: {word} beside the reference")
+    if text != "PSNR unknown":
+        shown = f"{text} {'' if lines else of + ' '}at {describe_exposure(split['exposure'])}"
+        lines.append(shown if word is None else f"{shown}: {word} beside the reference")
     others = [
         f"{SPLIT_NAMES.get(name, name)} {format_estimate(found['unexplained'])}"
         for name, found in errors.items()
@@ -135,28 +135,29 @@ def _remarks(errors: Mapping[str, Any], foreign: bool) -> list[str]:
 
 
 def _table_of(errors: Mapping[str, Any]) -> list[str]:
-    """A table of unexplained variance: overall, by level and by lowest cosine; a column per split. Rows and
-    columns without any are left out."""
+    """A table of unexplained variance: overall, by level and by lowest cosine; a column per split. Rows
+    without any are left out."""
 
     def cells(found: list[Mapping[str, Any] | None]) -> list[str]:
         known = [e if e is not None and e["unexplained"]["value"] is not None else None for e in found]
         return ["-" if e is None else format_estimate(e["unexplained"]) for e in known]
 
-    shown = {name: split for name, split in errors.items() if split["unexplained"]["value"] is not None}
-    rows = [["unexplained variance", *(SPLIT_NAMES.get(name, name) for name in shown)]]
-    rows.append(["all", *cells([*shown.values()])])
-    rows.append(["color alone", *cells([{"unexplained": split["color"]} for split in shown.values()])])
+    splits = errors.values()
+    rows = [["all", *cells([*splits])]]
+    rows.append(["color alone", *cells([{"unexplained": split["color"]} for split in splits])])
     for grouping, label in (("levels", "level"), ("elevations", "cosine")):
-        groups = {group for split in shown.values() for group in split[grouping]}
+        groups = {group for split in splits for group in split[grouping]}
         for group in sorted(groups, key=lambda g: float(g.split("-")[0])):
-            rows.append(
-                [f"{label} {group}", *cells([split[grouping].get(group) for split in shown.values()])]
-            )
-    rows = [row for row in rows if {*row[1:]} != {"-"}]
+            rows.append([f"{label} {group}", *cells([split[grouping].get(group) for split in splits])])
+    if all({*row[1:]} == {"-"} for row in rows):
+        return []
+    rows = [row for row in rows if row[0] == "all" or {*row[1:]} != {"-"}]
     partial = any("-" in row for row in rows)
-    rows.append(["queries", *(str(split["n"]) for split in shown.values())])
     why = ["-: too few queries, or values that vary less than their noise"] if partial else []
-    return [*format_table(rows).splitlines(), *why] if shown else []
+    why += [f"{SPLIT_NAMES.get(k, k)} {text}" for k, s in errors.items() if (text := unreliable(s))]
+    rows.append(["queries", *(str(split["n"]) for split in splits)])
+    names = ["unexplained variance", *(SPLIT_NAMES.get(name, name) for name in errors)]
+    return [*format_table([names, *rows]).splitlines(), *why]
 
 
 def format_table(rows: list[list[str]]) -> str:

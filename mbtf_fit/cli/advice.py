@@ -33,15 +33,20 @@ def advise(
     errors: dict[str, Any],
 ) -> tuple[str | None, list[str]]:
     """What reduces the error of a fit in a folder most: the command, and the lines that say why; neither
-    where :func:`suggest` has none. `errors` by split are those on the data set `shards`."""
+    where :func:`suggest` has none. `errors` by split are those on the data set `shards`; where these are
+    other test queries of the training data, the errors of its other splits are those of the fit."""
     from mbtf_core.data.dataset import Dataset
-    from mbtf_fit.training.fit_folder import training_digest
+    from mbtf_fit.training.fit_folder import configuration_digest, training_digest
 
-    step, training = suggest(material, history, errors), material.description["training"]
+    training, data, train = material.description["training"], Dataset.open(shards), None
+    is_other = training["shards_sha256"] != training_digest(data)
+    known = training.get("data_sha256")
+    if is_other and known is not None and known == configuration_digest(data) and "test" in errors:
+        errors, train = {**training["errors"], "test": errors["test"]}, training["data_queries"]
+    step = suggest(material, history, errors)
     if step is None:
         return None, []
-    data = Dataset.open(shards)
-    if training["shards_sha256"] != training_digest(data):
+    if is_other and train is None:
         return None, ["the fit had other training data; evaluate it on them for advice"]
-    command = step.command(material.config, training["seconds"], data, folder)
+    command = step.command(material.config, training["seconds"], data, folder, train)
     return command, [step.reason if command is None else f"{step.reason}:\n  {command}"]

@@ -65,10 +65,10 @@ def fit(
     """Fit a material to a data set: mbtf-fit shards/ -o material/
 
     The same command again resumes an unfinished fit. --time is that of training; the first line says about
-    how long reading, calibration and errors take beside it. Errors are those of test queries, which no fit is
-    trained on. --quality trains 800 steps at least, even if they take longer, as does --time "12s, at least
-    800 steps". --dry-run forecasts time and size by some seconds of training on this machine. With --many,
-    the output folder holds one folder per material.
+    how long reading, calibration and errors take beside it. Errors, the validation error too, are those of
+    test queries, which no fit is trained on. --quality trains 800 steps at least, even if they take longer,
+    as does --time "12s, at least 800 steps". --dry-run forecasts time and size by some seconds of training on
+    this machine. With --many, the output folder holds one folder per material.
 
     Parameters
     ----------

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_fit.formatting import format_estimate
+
+# Share of the training time up to which a shorter one is suggested.
+_SHORTER = 0.75
 
 
 def describe_validations(records: Sequence[dict[str, Any]]) -> str:
@@ -46,10 +50,12 @@ def describe_kept(history: Sequence[dict[str, Any]], kept: int | None) -> str | 
     if best is None:
         return None
     last = history[-1]
-    return (
+    text = (
         f"validation error rose from {best['unexplained']:.2g} after {kept} steps to "
         f"{last['unexplained']:.2g} after {last['step']}: kept the state after {kept} steps"
     )
+    share = math.ceil(20.0 * best["step"] / last["step"]) / 20.0
+    return f"{text}; {share:.0%} of the time suffices" if share <= _SHORTER else text
 
 
 def describe_ending(config: FitConfig, history: Sequence[dict[str, Any]]) -> str | None:

@@ -25,6 +25,7 @@ _UNCERTAIN = 0.25
 _SIGNIFICANT = 2.0
 # Of an error that is all due to noise, twice the queries remove this share.
 _LIMITED = 0.3
+_NO_GAIN = "neither twice the training nor twice the queries would reduce the error by 5%"
 # Flags of generator and fit, by the key that a recipe has.
 _FLAGS = {
     "generate.queries.train": "--queries",
@@ -66,26 +67,33 @@ class NextStep:
             more |= {} if queries.get("test_highlights") else {"generate.queries.test_highlights": "75%"}
         return more
 
-    def command(self, config: FitConfig, seconds: float, data: Dataset, material: Path) -> str | None:
+    def command(
+        self, config: FitConfig, seconds: float, data: Dataset, material: Path, train: str | None = None
+    ) -> str | None:
         """The whole command, which writes to new folders, for a fit of so many seconds in the folder
-        `material`; None where there is nothing to do, or where its data are of an unknown source."""
+        `material`; None where there is nothing to do, or where its data are of an unknown source. `train`:
+        number of its training queries, where `data` have others."""
         made = data.manifest.get("config") or {}
+        trains_here = self.kind == "time" and train is None
         # Measured data have no path of their file, those of another program no configuration.
-        if self.kind == "none" or not (self.kind == "time" or {"material", "queries"} <= made.keys()):
+        if self.kind == "none" or not (trains_here or {"material", "queries"} <= made.keys()):
             return None
-        more = self.options(config, seconds, made.get("queries", {}))
-        fitted = ["--config", str(material / "config.yaml")]
-        out = ["-o", _numbered(str(material))]
-        if self.kind == "time":
-            return shlex.join(["mbtf-fit", str(data.folder), *fitted, *_flags(more), *out])
+        queries = made.get("queries", {})
+        more = self.options(config, seconds, queries if train is None else {**queries, "train": train})
+        config_file, out = str(material / "config.yaml"), _numbered(str(material))
+        fitted = ["--config", config_file, *_flags(more, "fit."), "-o", out]
+        if trains_here:
+            return shlex.join(["mbtf-fit", str(data.folder), *fitted])
         shards = _numbered(str(data.folder))
-        then = ["mbtf-fit", shards, *fitted, *out]
+        then = ["mbtf-fit", shards, *fitted]
         if self.kind == "test":
             # The training queries need not be made again; those of other layouts come in large units.
             more = {"generate.queries.train": "1"} | more if data.layout == "shuffled" else more
             then = ["mbtf-fit", "evaluate", str(material), shards]
+        elif train is not None:
+            more = {"generate.queries.train": train} | more
         words = ["mbtf-gen", made["material"], "--config", str(data.folder.at(CONFIG_NAME))]
-        return f"{shlex.join([*words, *_flags(more), '-o', shards])} && {shlex.join(then)}"
+        return f"{shlex.join([*words, *_flags(more, 'generate.'), '-o', shards])} && {shlex.join(then)}"
 
 
 def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
@@ -96,7 +104,8 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     untrained = cost.steps < _UNTRAINED and cost.doubling is None
     overfit, limit = 0.5 * (cost.noise_share or 0.0), _LIMITED * cost.noise_limit
     data = 1.0 - max(overfit, limit)
-    if cost.few and (value is None or value >= 1.0 or untrained):
+    # A fit that kept an earlier state has trained long enough.
+    if cost.kept_step is None and cost.few and (value is None or value >= 1.0 or untrained):
         factor = 2 ** math.ceil(math.log2(FEWEST_STEPS / cost.steps))
         return NextStep("time", f"{cost.steps} steps are few: train {factor} times as long", factor)
     short = ""
@@ -119,22 +128,28 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     if value >= 1.0 and own is not None and own < 1.0:
         return NextStep("queries", "the training queries are too few or too noisy")
     if cost.kept_step is not None:
-        most = f"expect at most {1.0 - overfit:.2g} of this error with twice the queries"
-        more = "twice the queries let it train longer" if 1.0 - overfit >= FLAT else most
-        return NextStep("queries", f"{short}; {more}")
+        if 1.0 - overfit >= FLAT:
+            return NextStep("none", f"{short}; {_NO_GAIN}")
+        return NextStep("queries", f"{short}; {_about(1.0 - overfit)} with twice the queries")
     time = cost.doubling
     if data < min(FLAT, 1.0 if time is None else time):
-        return NextStep("queries", f"{short}; expect about {data:.2g} of this error with twice the queries")
+        return NextStep("queries", f"{short}; {_about(data)} with twice the queries")
     if time is None:
         reason = f"{cost.steps} steps are few" if cost.few else "it is unknown what longer training gains"
         return NextStep("time", f"{reason}; try twice the training")
     if time < FLAT or cost.few:
-        return NextStep("time", f"expect about {time:.2g} of this error after twice the training")
-    return NextStep("none", "neither twice the training nor twice the queries would reduce the error by 5%")
+        return NextStep("time", f"{_about(time)} after twice the training")
+    return NextStep("none", _NO_GAIN)
 
 
-def _flags(options: Mapping[str, str]) -> list[str]:
-    return [word for key, value in options.items() for word in (_FLAGS[key], value)]
+def _about(factor: float) -> str:
+    return f"expect about {factor:.2g} of this error"
+
+
+def _flags(options: Mapping[str, str], section: str) -> list[str]:
+    """Flags of the options of a section, ``generate.`` or ``fit.``."""
+    given = {_FLAGS[key]: value for key, value in options.items() if key.startswith(section)}
+    return [word for flag in given.items() for word in flag]
 
 
 def _numbered(folder: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from mbtf_core.app.console import run
 from mbtf_core.errors import InputError
 from mbtf_fit.cli.app import app
 from mbtf_fit.evaluation import score_predictions
-from mbtf_fit.formatting import visibility
+from mbtf_fit.formatting import report_errors, visibility
 
 NOISE, OFFSET = 0.02, 0.01
 
@@ -74,6 +75,7 @@ def test_what_cannot_be_scored_is_refused(shards: Path, tmp_path: Path) -> None:
         (0.0, 5e-4, "PSNR above 30.0 dB", "visible at most"),
         # A bound that excludes nothing.
         (0.0, 250.0, "PSNR unknown", None),
+        (0.0, 0.005, "PSNR above 20.0 dB", None),
         (0.0, 0.0, "PSNR infinite", "not visible"),
     ],
 )
@@ -82,3 +84,25 @@ def test_psnr_has_a_word(mse: float, error: float, text: str, word: str | None) 
     for factor, exposure in ((1, 0.0), (16, -2.0)):
         errors = {"value": factor * mse, "error": factor * error}
         assert visibility({"mse": errors, "exposure": exposure}) == (text, word)
+
+
+def test_an_undefined_error_has_its_psnr_and_its_column() -> None:
+    """Noise hides the variance of test queries; ten of the held-out queries make most of their error."""
+
+    def split(value: float | None, ten_largest: float) -> dict[str, Any]:
+        unexplained = {"value": value, "error": None if value is None else 0.005}
+        more = {"levels": {}, "elevations": {}, "color": {"value": None, "error": None}}
+        mse = {"value": 0.001, "error": 0.002}
+        return (
+            {"n": 5000, "unexplained": unexplained, "mse": mse, "exposure": 0.0}
+            | more
+            | {"ten_largest": ten_largest}
+        )
+
+    found = {"test": split(None, 0.1), "held_out_queries": split(0.009, 0.8), "training": split(0.02, 0.1)}
+    text = "\n".join(report_errors(found, None, verbose=True))
+    assert "PSNR above 23.0 dB of 5000 test queries" in text
+    header = next(line for line in text.splitlines() if line.startswith("unexplained variance"))
+    assert all(name in header for name in ("test queries", "held-out queries", "training queries"))
+    assert "held-out queries unreliable" in text
+    assert "training queries unreliable" not in text

@@ -11,6 +11,7 @@ import pytest
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.folder import DataFolder
 from mbtf_fit.config import FitConfig
+from mbtf_fit.training.endings import describe_kept
 from mbtf_fit.training.next_step import NextStep, next_step
 from mbtf_fit.training.validation import FLAT, MarginalCost, caveat, marginal_cost_of
 
@@ -199,6 +200,21 @@ def test_a_fit_that_kept_an_earlier_state_needs_more_queries() -> None:
         found = next_step(MarginalCost(doubling, 0.4, 4000, 0.0, 480, 1.4, 50.0, 1.0), fitted(0.2, 0.002))
         assert found.kind == "queries"
         assert "0.8 of this error" in found.reason
+    # Where no overfitting is left, the same error is expected of twice the queries.
+    for share, kind in ((None, "none"), (0.08, "none"), (0.12, "queries")):
+        step = next_step(MarginalCost(0.8, share, 4000, kept_step=1024), fitted(0.2, 0.002))
+        assert step.kind == kind
+        assert "after 1024 steps" in step.reason
+    # Few steps ask for more only where the last of them was the best.
+    for kept, kind in ((None, "time"), (32, "queries")):
+        assert next_step(MarginalCost(None, None, 90, kept_step=kept), fitted(1.2, 0.1)).kind == kind
+
+
+def test_an_early_best_state_suggests_a_shorter_time() -> None:
+    records = [{"step": step, "unexplained": 0.2} for step in (1024, 3500, 4000)]
+    assert str(describe_kept(records, 1024)).endswith("30% of the time suffices")
+    assert str(describe_kept(records, 3500)).endswith("kept the state after 3500 steps")
+    assert describe_kept(records, None) is None
 
 
 def test_the_next_command_is_complete(tmp_path: Path) -> None:
@@ -223,6 +239,13 @@ def test_the_next_command_is_complete(tmp_path: Path) -> None:
     assert command("queries") == f"{made} --queries 100/texel -o shards-2 && {again}"
     more = "--queries 1 --test-queries 32768 --test-highlights 75%"
     assert command("test") == f"{made} {more} -o shards-2 && mbtf-fit evaluate material shards-2"
+    # Data of other test queries alone: the training queries are made again.
+    for kind, train, time in (("queries", "400/texel", ""), ("time", "200/texel", " --time 1min")):
+        found = NextStep(kind, "").command(config, 30.1, data, Path("material"), "200/texel")  # type: ignore[arg-type]
+        expected = f"{made} --queries {train} -o shards-2 && mbtf-fit shards-2 {fitted}{time} -o material-2"
+        assert (found or "").replace(f"{tmp_path}/", "") == expected
+    found = NextStep("test", "").command(config, 30.1, data, Path("material"), "200/texel")
+    assert (found or "").replace(f"{tmp_path}/", "") == command("test")
     # The digits of a name count nothing; a second sequel does.
     for name, following in (("b2_500", "b2_500-2"), ("m-2/", "m-3"), ("m-64", "m-64-2")):
         found = NextStep("time", "").command(config, 30.0, data, Path(name))
