@@ -151,7 +151,8 @@ def load_training(
 
     Parameters
     ----------
-    memory : bytes that training queries may take; more are streamed from disk; None streams in any case
+    memory : bytes that training queries may take; more are streamed from disk; None, of an evaluation,
+        streams in any case, and accepts that all are held out, as in test sets with a single one
 
     Raises
     ------
@@ -199,7 +200,7 @@ def load_training(
             for name in ("u", "sigma", "omega_i", "omega_o"):
                 np.take(getattr(queries, name), rows, axis=0, out=store[name][part], mode="clip")
             store["value"][part] = mean_value(queries.value_a[rows], queries.value_b[rows])
-    if len(selection) == 0:
+    if len(selection) == 0 and memory is not None:
         raise _all_held_out(data, f"{total} queries")
     training: TrainingQueries | StreamedQueries = StreamedQueries(selection, estimates=data.estimates)
     if not streamed:
