@@ -120,7 +120,7 @@ def expected_seconds(
         span = f"{clock(seconds.low)} to {clock(seconds.high)}"
         return f"error {error:g}: about {clock(seconds.value)} ({span})"
     if within < math.inf:
-        return f"error {error:g}: reached within {clock(min(within, seconds.high))}"
+        return f"error {error:g}: reached within {clock(within)}"
     if seconds.low == math.inf:
         return f"error {error:g}: not reachable {why}: they limit it at about {limit}"
     least = f", but it takes at least {clock(seconds.low)}" if seconds.low >= 1.0 else ""

@@ -107,7 +107,7 @@ def test_an_error_above_all_bounds_is_reached_in_the_time() -> None:
     error, time = Interval(0.019, 0.012, 0.024), Interval(20.0, 0.5, 280.0)
     limit = Interval(0.01, 0.0, 0.02)
     found = ErrorForecast(300.0, error, (0.05, time), limit).describe()
-    assert "error 0.05: reached within 4:40" in found
+    assert "error 0.05: reached within 5:00" in found
     # Overfitting may add more.
     above = ErrorForecast(300.0, replace(error, high=0.06), (0.05, replace(time, high=math.inf)), limit)
     assert "reached" not in above.describe()
