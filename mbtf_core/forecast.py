@@ -100,7 +100,9 @@ def expected_error(seconds: float, error: Interval) -> str:
     return f"{clock(seconds)}: {INSUFFICIENT}"
 
 
-def expected_seconds(error: float, seconds: Interval, limit: Interval, why: str) -> str:
+def expected_seconds(
+    error: float, seconds: Interval, limit: Interval, why: str, *, within: float = math.inf
+) -> str:
     """How long an error is expected to take, in one line.
 
     Parameters
@@ -111,10 +113,14 @@ def expected_seconds(error: float, seconds: Interval, limit: Interval, why: str)
         Time that reaches it, and error that no time undercuts.
     why : str
         What limits the error, such as ``with these queries``.
+    within : float
+        Time whose error is at most this one even at its upper bound; infinite where none is known.
     """
     if seconds.suffices:
         span = f"{clock(seconds.low)} to {clock(seconds.high)}"
         return f"error {error:g}: about {clock(seconds.value)} ({span})"
+    if within < math.inf:
+        return f"error {error:g}: reached within {clock(within)}"
     if seconds.low == math.inf:
         return f"error {error:g}: not reachable {why}: they limit it at about {limit}"
     least = f", but it takes at least {clock(seconds.low)}" if seconds.low >= 1.0 else ""

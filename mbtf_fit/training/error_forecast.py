@@ -8,6 +8,7 @@ all queries bounds that of the fit, which has more queries to generalize from.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -81,7 +82,9 @@ class ErrorForecast:
                 "longer training may not"
             )
         if self.asked is not None:
-            lines.append(expected_seconds(*self.asked, self.limit, "with these queries and this network"))
+            within = self.seconds if self.error.high <= self.asked[0] else math.inf
+            why = "with these queries and this network"
+            lines.append(expected_seconds(*self.asked, self.limit, why, within=within))
         return "\n".join(lines)
 
 

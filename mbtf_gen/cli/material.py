@@ -124,17 +124,16 @@ def plan(
 
     job = prepare_job(options, material, quality)
     job.announce_briefly()
-    found = plan_effects(job)
-    note = ""
-    if skips_pilots(job) and any(decision.reason == "pilot" for decision in found.effects):
-        note = "\nthis run is too small to measure effects by a pilot: it simulates all that the bounds keep"
+    small = skips_pilots(job)
+    found = plan_effects(job, pilots=not small)
+    note = found.omitted_by(plan_effects(job)) if small else ""
     if not measure:
-        console.report({**found.to_manifest(), "forecast": None}, found.describe() + note)
+        console.report({**found.to_manifest(), "forecast": None}, found.describe(note))
         return
     from mbtf_gen.forecast import forecast
     from mbtf_gen.planning.run_plan import allocate, measured
 
     expected = forecast(job, allocate(job, found))
     found = measured(job, found)
-    text = f"{found.describe()}{note}\n{expected.describe(split_target(job.config, 'train'))}"
+    text = f"{found.describe(note)}\n{expected.describe(split_target(job.config, 'train'))}"
     console.report({**found.to_manifest(), "forecast": asdict(expected)}, text)

@@ -29,6 +29,8 @@ def preview(
 ) -> None:
     """Draw the mesh, a path-traced picture, and the queries.
 
+    Yarns and fibers have no mesh: they are drawn in the path-traced picture alone.
+
     Parameters
     ----------
     material

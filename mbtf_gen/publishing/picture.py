@@ -21,8 +21,10 @@ from mbtf_gen.measured.exported import mean_of
 
 F64 = NDArray[np.float64]
 PICTURE_NAME = "contact_sheet.png"
-# Panels of the tile: the side that grazing lights come from; (0, 0) takes all lights.
-_SIDES = {"all lights": (0, 0), "grazing light from the left": (-1, 0), "grazing light from the top": (0, 1)}
+# Panels of the tile: whether they take grazing lights from the left alone.
+_PANELS = {"all lights": False, "light from the left": True}
+# Exponent of luminance under grazing light, whose smoothing leaves little contrast.
+_CONTRAST = 1.6
 # Highest elevation of grazing lights, and elevations of the lights of the BRDF, in degrees. The lowest
 # lights have the most contrast, and the more there are, the narrower is the smoothing.
 _GRAZING, _ELEVATIONS = 45.0, (35.0, 65.0)
@@ -64,9 +66,9 @@ def tile_images(arrays: Arrays, aspect: float, geometry: Geometry | None) -> dic
         u[known] = visible_positions(u[known], view[known], geometry)
     grazing = light[:, 2] <= np.sin(np.radians(_GRAZING))
     out = {}
-    for title, side in _SIDES.items():
-        from_side = light[:, :2] @ side >= 0.5 * np.hypot(*light[:, :2].T)
-        found = known & grazing & from_side if any(side) else known
+    for title, grazes in _PANELS.items():
+        from_left = -light[:, 0] >= 0.5 * np.hypot(*light[:, :2].T)
+        found = known & grazing & from_left if grazes else known
         out[title] = _smoothed(u[found], sigma[found], value[found], aspect)
     return out
 
@@ -134,6 +136,17 @@ def _queries(arrays: Arrays) -> tuple[F64, F64, F64, F64]:
     return u.reshape(-1, 2), light.reshape(-1, 3), view.reshape(-1, 3), value
 
 
+def contrasted(image: F64) -> F64:
+    """An image (..., 3) of larger ratios of luminance, and of the same colors and geometric mean."""
+    bright = image.mean(axis=-1, keepdims=True)
+    lit = bright > 0
+    if not lit.any():
+        return image
+    level = np.exp(np.log(bright[lit]).mean())
+    factor = np.divide(bright, level, out=np.ones_like(bright), where=lit) ** (_CONTRAST - 1.0)
+    return np.asarray(image * factor)
+
+
 def displayed(image: F64) -> NDArray[np.uint8]:
     """8-bit sRGB of an image (..., 3) that keeps albedos; pixels without queries are light gray."""
     known = np.asarray(np.isfinite(image).all(axis=-1))
@@ -146,9 +159,11 @@ def write_picture(arrays: Arrays, aspect: float, geometry: Geometry | None, path
     """Write the contact sheet of training queries and of a geometry as a PNG, atomically."""
     from matplotlib.figure import Figure
 
-    panels = [
-        (title, image, (0, 1, 0, aspect)) for title, image in tile_images(arrays, aspect, geometry).items()
-    ]
+    panels = []
+    for title, image in tile_images(arrays, aspect, geometry).items():
+        if _PANELS[title]:
+            title, image = f"{title}, contrasted", contrasted(image)
+        panels.append((title, image, (0, 1, 0, aspect)))
     panels.append(("apparent BRDF by ω_o", brdf_image(arrays), (-1, 1, -1, 1)))
     figure = Figure(figsize=(3.0 * (len(panels) + (geometry is not None)), 3.3), layout="constrained")
     axes: Any = figure.subplots(1, len(panels) + (geometry is not None))

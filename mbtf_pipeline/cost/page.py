@@ -108,7 +108,8 @@ def _front_section(runs: Sequence[Measurement], evidence: Evidence, png: Path) -
 
     axes = "seconds in total, from height map to material", "unexplained variance of test queries"
     caption = "Labels: error and total time of the runs on the Pareto front."
-    series = [_series("complete runs", runs, label=name, style="points")]
+    bars = "their time: scatter, and what other work may have added"
+    series = [_series("complete runs", runs, label=name, style="points", x_error_name=bars)]
     if front and len(stops := front[-1].curve) > 0:
         x, y = zip(*stops, (front[-1].seconds.value, front[-1].error.value), strict=True)
         series.append(Series("the longest of them, if stopped early", x, y))

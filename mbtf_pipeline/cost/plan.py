@@ -63,7 +63,7 @@ class StudyPlan:
             lines.append(
                 f"estimated from a pilot of the generator, while other work leaves {self.share:.0%} of the "
                 f"processors, and {self.overhead:.0f} s per run for loading and evaluation; the first run "
-                "measures training and the rest, so fewer runs may fit"
+                "measures training and the rest, so fewer runs may fit and a forecast may take longer"
             )
         if not self.runs and self.least_run is not None:
             return "\n".join([*lines, no_run(self.least_run, self.least)])

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mbtf_core.files.atomic import write_through
+from mbtf_pipeline.report.labels import place_labels
 
 # Okabe and Ito (2008) with gray instead of black and without yellow: distinguishable under every common
 # color-vision deficiency.
@@ -19,7 +21,7 @@ COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7F
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 ERROR_BAR_NOTE = (
     "Error bars and bands show one standard error. Logarithmic axes end at half the smallest positive value "
-    "and at twice the largest."
+    "and at twice the largest, or show bands up to a tenth and ten times of these."
 )
 # Placeholder for the page's text color until the SVG is embedded.
 _INK = "#010203"
@@ -48,6 +50,7 @@ class Series:
         none; those not finite are not drawn
     labels : (n,), one per point, or none
     style : a line with a band, points, or points joined by a line; hollow : whether markers are hollow
+    x_error_name : what the legend calls bars along x, if anything
     """
 
     name: str
@@ -58,6 +61,7 @@ class Series:
     labels: Sequence[str] = ()
     style: Literal["line", "points", "joined"] = "line"
     hollow: bool = False
+    x_error_name: str = ""
 
 
 def plot(
@@ -100,9 +104,13 @@ def plot(
         axes.patch.set_alpha(0.0)
         axes.set(xlabel=x, ylabel=y, **{f"{axis}scale": "log" for axis in log})
         axes.grid(True, which="major", color=_INK, alpha=0.12, linewidth=0.6)
-        positive = [v for one in series for v in one.y if v > 0]
-        low, high = (min(positive) / 2.0, max(positive) * 2.0) if positive else (0.1, 1.0)
-        handles = [_draw(axes, index, one, low, high) for index, one in enumerate(series)]
+        low, high = _range(series)
+        handles: list[tuple[Any, str]] = []
+        labels: list[Any] = []
+        for index, one in enumerate(series):
+            entries, notes = _draw(axes, index, one, low, high)
+            handles += entries
+            labels += notes
         if front:
             step = axes.step(*np.asarray(front, float).T, where="post", color=_INK, lw=1.3, ls=(0, (4, 2)))
             handles.append((step[0], "Pareto front"))
@@ -119,6 +127,7 @@ def plot(
         if handles:
             marks, names = zip(*handles, strict=True)
             figure.legend(marks, names, ncols=2, loc="outside upper left", frameon=False, fontsize=8.5)
+        place_labels(axes, labels)
         if png is not None:
             options = {"dpi": 160, "facecolor": "white", "metadata": {"Software": None}}
             write_through(png, lambda path: figure.savefig(path, format="png", **options))
@@ -143,18 +152,38 @@ def points(
     return plot(shown, x, y, label, log="y", groups=groups)
 
 
-def _draw(axes: Any, index: int, one: Series, low: float, high: float) -> tuple[Any, str]:
-    """Draw a series, its values within the limits of the axis; returns its mark and name for the legend."""
+def _range(series: Sequence[Series]) -> tuple[float, float]:
+    """Lowest and highest value that a logarithmic y axis may show."""
+    positive = [v for one in series for v in one.y if v > 0]
+    if not positive:
+        return 0.1, 1.0
+    low, high = min(positive), max(positive)
+    ends = np.concatenate(
+        [_bounds(one).ravel() for one in series if one.style == "line" and one.y_error is not None]
+        or [np.empty(0)]
+    )
+    ends = np.clip(ends[ends > 0], 0.1 * low, 10.0 * high)
+    return min(low / 2.0, ends.min(initial=low) / 1.1), max(high * 2.0, ends.max(initial=high) * 1.1)
+
+
+def _bounds(one: Series) -> NDArray[np.float64]:
+    """Ends (2, n) of the error bars of a series, below and above."""
+    lower, upper = np.broadcast_to(np.asarray(one.y_error, float), (2, len(one.y)))
+    return np.asarray(one.y, float) + np.stack([-lower, upper])
+
+
+def _draw(
+    axes: Any, index: int, one: Series, low: float, high: float
+) -> tuple[list[tuple[Any, str]], list[Any]]:
+    """Draw a series, its values within the limits of the axis; returns its marks and names for the legend,
+    and its labels, which are still to be placed."""
     color = COLORS[index % len(COLORS)]
-    x, exact = np.asarray(one.x, float), np.asarray(one.y, float)
-    y = np.clip(exact, low, high)
+    x, y = np.asarray(one.x, float), np.clip(np.asarray(one.y, float), low, high)
     if one.style == "line":
         (mark,) = axes.plot(x, y, color=color, linewidth=1.7)
         if one.y_error is not None:
-            lower, upper = np.broadcast_to(np.asarray(one.y_error, float), (2, len(y)))
-            below, above = (np.clip(exact + side, low, high) for side in (-lower, upper))
-            axes.fill_between(x, below, above, color=color, alpha=0.18, linewidth=0)
-        return mark, one.name
+            axes.fill_between(x, *np.clip(_bounds(one), low, high), color=color, alpha=0.18, linewidth=0)
+        return [(mark, one.name)], []
     x_error, y_error = (
         None if error is None else np.minimum(np.nan_to_num(error, posinf=0.0), 0.95 * values)
         for error, values in ((one.x_error, x), (one.y_error, y))
@@ -164,12 +193,18 @@ def _draw(axes: Any, index: int, one: Series, low: float, high: float) -> tuple[
     drawn = axes.errorbar(x, y, y_error, x_error, color=color, markerfacecolor=fill, **marker)
     if one.style == "joined":
         axes.plot(x, y, color=color, linewidth=0.8, alpha=0.5)
-    for x0, y0, text in zip(x, y, one.labels, strict=False):
-        # A front descends to the right, so that it leaves this corner free.
-        note = axes.annotate(text, (x0, y0), (6, 5), textcoords="offset points", fontsize=7.5, color=color)
+    style = {"textcoords": "offset points", "fontsize": 7.5, "color": color}
+    labels = [
+        axes.annotate(text, at, (6, 5), **style) for *at, text in zip(x, y, one.labels, strict=False) if text
+    ]
+    for label in labels:
         # Otherwise constrained layout would shrink the axes for the label.
-        note.set_in_layout(False)
-    return drawn.lines[0], one.name
+        label.set_in_layout(False)
+    marks = [(drawn.lines[0], one.name)]
+    if one.x_error_name:
+        (bar,) = axes.plot([], [], color=color, linewidth=1.1, marker="|", markersize=5)
+        marks.append((bar, one.x_error_name))
+    return marks, labels
 
 
 def _extend(axes: Any) -> None:

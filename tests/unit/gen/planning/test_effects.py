@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from support.command_lines import call
 
 from mbtf_core.errors import UsageError
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.effects_plan import EffectsPlan
-from mbtf_gen.planning.run_plan import measured, plan_effects, reference_plan
+from mbtf_gen.planning.run_plan import measured, plan_effects, plan_run, reference_plan
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 HEIGHTS = np.array([[0.0, 0.1], [0.05, 0.02]])
@@ -175,3 +177,20 @@ def test_a_plan_never_measures_a_rare_change_as_exactly_zero() -> None:
     job = one_bump(128)
     shadowing = measured(job, plan_effects(job))["shadowing"]
     assert shadowing.bias_bound + 2 * shadowing.error > TRUE_CHANGE
+
+
+def test_the_printed_plan_is_that_of_the_run(tmp_path: Path) -> None:
+    """Which is too small for pilots; what those would omit is said beside it."""
+    heights = np.random.default_rng(0).random((16, 16))
+    np.save(tmp_path / "heights.npy", heights)
+    words = ["mbtf-gen", "plan", str(tmp_path / "heights.npy"), "--height-scale", "0.05"]
+    words += ["--queries", "1/texel", "--no-measure"]
+    stated = call([*words, "--json"]).result()
+    config = {"material": str(tmp_path / "heights.npy"), "geometry": {"height_scale": 0.05}}
+    job = Job.load(GeneratorConfig.model_validate({**config, "queries": {"train": "1/texel"}}))
+    run, larger = plan_run(job).effects, plan_effects(job)
+    assert (stated["max_depth"], stated["bias_bound"]) == (run.max_depth, run.bias_bound) == (0, 0.0)
+    assert larger.max_depth > 0
+    *_, bound, note = call(words).out.splitlines()
+    assert "effects: 0%" in bound
+    assert f"larger one would omit what follows {larger.max_depth} surface interactions" in note

@@ -13,7 +13,7 @@ from support.fit_data import write_data
 from support.published import LAYOUTS, small
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_gen.publishing.picture import brdf_image, tile_images, write_picture
+from mbtf_gen.publishing.picture import brdf_image, contrasted, tile_images, write_picture
 
 
 def test_images_have_v_and_the_light_where_they_belong(tmp_path: Path) -> None:
@@ -50,11 +50,20 @@ def test_few_queries_show_ridges(tmp_path: Path) -> None:
     write_data(tmp_path / "data", value, train=8000, test=10, finest=6)
     arrays = Dataset.open(tmp_path / "data").load("train")
     plane: Any = SimpleNamespace(heights=np.full((8, 8), -1e-6, np.float32), aspect=1.0)
-    panel = tile_images(arrays, 1.0, plane)["grazing light from the left"][..., 0]
+    panel = tile_images(arrays, 1.0, plane)["light from the left"][..., 0]
     profile = panel.mean(axis=0) / panel.mean() - 1.0
     wave = np.cos(8 * np.pi * (np.arange(len(profile)) + 0.5) / len(profile))
     # 0.15; of lights above 20° and higher views, 0.07.
     assert 2 * (profile * wave).mean() > 0.11
+
+
+def test_contrast_keeps_colors_and_gaps() -> None:
+    image = np.array([[[0.2, 0.1, 0.1], [0.4, 0.2, 0.2]], [[0.0, 0.0, 0.0], [np.nan, np.nan, np.nan]]])
+    found = contrasted(image)
+    assert found[0, 1, 0] / found[0, 0, 0] > 2.5
+    np.testing.assert_allclose(found[0, :, 1] / found[0, :, 0], 0.5)
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(image))
+    assert not found[1, 0].any()
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
