@@ -130,19 +130,24 @@ def test_rays_over_a_sphere_meet_what_small_steps_find(kappa: float, inside: boo
 TURN = np.array([[np.cos(0.6), -np.sin(0.6)], [np.sin(0.6), np.cos(0.6)]])
 
 
+def sunken(folder: Path, depth: float, aspect: float = 1.0) -> dict[str, Any]:
+    """A material whose heights are all at the bottom."""
+    lattice = Lattice(5, aspect)
+    heights = np.full(lattice.shape(), -depth, np.float32)
+    known = KnownSurface.of(geometry(lattice, heights, color=(0.5,) * 3), lattice, 0.0)
+    write_material(folder, model="relief", finest=5, aspect=aspect, constant=(0.1,) * 3, known=known)
+    return {"type": "mbtf", "material": str(folder), "silhouettes": True}
+
+
 @pytest.mark.parametrize(
     ("turn", "scale", "aspect"),
     [(np.eye(2), (1.0, 1.0), 1.0), (TURN, (2.0, 8.0), 0.5), (TURN @ np.diag([-1.0, 1.0]), (3.0, 3.0), 1.0)],
 )
 def test_rays_meet_the_bottom_over_a_cylinder(turn: F64, scale: Any, aspect: float, tmp_path: Path) -> None:
-    """Heights that are all at the bottom are a cylinder inside: places, normals, and rays that pass, under
-    any texture coordinates, from before and behind."""
-    depth, lattice, chart = 0.1, Lattice(5, aspect), Chart("cylinder", 6, 1.0)
-    heights = np.full(lattice.shape(), -depth, np.float32)
-    known = KnownSurface.of(geometry(lattice, heights, color=(0.5,) * 3), lattice, 0.0)
-    write_material(tmp_path, model="relief", finest=5, aspect=aspect, constant=(0.1,) * 3, known=known)
-    bsdf = {"type": "mbtf", "material": str(tmp_path), "silhouettes": True}
-    mesh = chart.mesh(None, bsdf | {"uv_scale": f"{scale[0]},{scale[1]}"}, 32)
+    """They are a cylinder inside: places, normals, and rays that pass, under any texture coordinates, from
+    before and behind."""
+    depth, chart = 0.1, Chart("cylinder", 6, 1.0)
+    mesh = chart.mesh(None, sunken(tmp_path, depth, aspect) | {"uv_scale": f"{scale[0]},{scale[1]}"}, 32)
     parameters = mi.traverse(mesh)
     flat = np.array(parameters["vertex_texcoords"]).reshape(-1, 2) * [1.0, -1.0] + [0.0, 1.0]
     parameters["vertex_texcoords"] = ((flat @ turn.T) / scale).astype(np.float32).ravel()
@@ -176,6 +181,38 @@ def test_rays_meet_the_bottom_over_a_cylinder(turn: F64, scale: Any, aspect: flo
     assert np.mean(passed == ~inside) > 0.98
 
 
+def test_sharp_edges_are_rounded(tmp_path: Path) -> None:
+    """To twice the depth of the shell."""
+    shell = mi.load_dict(sunken(tmp_path, 0.1)).shell
+    u, view, sharp = mi.Point2f(0.5, 0.5), mi.Vector3f(0.6, 0.0, 0.8), mi.Vector3f(100.0, 30.0, -80.0)
+    xx, xy, yy = np.array(shell.meet(u, mi.Float(3.0), view, sharp, mi.Float(0.05)).curvature).ravel()
+    assert 0.1 < 0.1 * np.abs(np.linalg.eigvalsh([[xx, xy], [xy, yy]])).max() < 0.5
+
+
+def test_the_shadow_is_that_of_the_heights(tmp_path: Path) -> None:
+    """Of the cylinder inside, on a wall."""
+    chart, turned = Chart("cylinder", 6, 1.0), mi.ScalarTransform4f()
+    wall = turned.translate([4, 0, 0]).rotate([0, 1, 0], -90).scale(9.0)
+    sensor = {
+        "type": "orthographic",
+        "to_world": turned.look_at([2, 0, 0], [4, 0, 0], [0, 0, 1]).scale([1.2, 1.2, 1.0]),
+        "film": {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb"},
+    }
+    white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
+    scene = load_scene(
+        {
+            "type": "scene",
+            "sensor": sensor,
+            "mesh": chart.mesh(None, sunken(tmp_path, 0.1), 32),
+            "wall": {"type": "rectangle", "to_world": wall, "bsdf": white},
+            "light": {"type": "directional", "direction": [1, 0, 0], "irradiance": 1.0},
+        }
+    )
+    picture = mi.render(scene, integrator=mi.load_dict({"type": "mbtf_path", "max_depth": 2}), spp=64)
+    lit = 1.0 - (chart.radius - 0.1) / 1.2
+    assert np.pi * float(np.array(picture).mean()) == pytest.approx(lit, abs=0.02)
+
+
 def holes(coefficient: float) -> Transmittance:
     """Holes that are seen differently from all sides."""
     return Transmittance(Lattice(3), [np.full((2**k, 2**k, 6), coefficient, np.float32) for k in range(4)])
@@ -184,7 +221,8 @@ def holes(coefficient: float) -> Transmittance:
 @pytest.mark.parametrize("sampling", ["lobes", "cosine"])
 def test_samples_are_those_of_value_and_density(sampling: str, tmp_path: Path) -> None:
     """Where some rays miss the heights, and others pass holes."""
-    write_material(tmp_path, model="relief", finest=3, transmittance=holes(0.2))
+    two = {"relief": {"places": 2}}
+    write_material(tmp_path, model="relief", network=two, finest=3, transmittance=holes(0.2))
     bsdf = {
         "type": "mbtf",
         "material": str(tmp_path),
@@ -192,13 +230,19 @@ def test_samples_are_those_of_value_and_density(sampling: str, tmp_path: Path) -
         "sampling": sampling,
         "sigma": 0.2,
     }
-    scene = load_scene({"type": "scene", "mesh": Chart("sphere", 8, 1.0).mesh(None, bsdf)})
+    mesh = Chart("sphere", 8, 1.0).mesh(None, bsdf)
+    scene = load_scene({"type": "scene", "mesh": mesh})
     aim = np.random.default_rng(5).uniform(0.75, 1.0, 40000).astype(np.float32) * (4 / np.pi)
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(-9.0, mi.Float(aim), 0.1), mi.Vector3f(1, 0, 0)))
     material, context, random = si.bsdf(), mi.BSDFContext(), mi.PCG32(40000)
     numbers = [random.next_float32() for _ in range(5)]
     through = material.eval_null_transmission(si).x
-    assert 0.1 < np.mean(np.array(through) == 1.0) < 0.9
+    hit = mesh.bsdf()._view(si).hit
+    # Of two rays one alone meets the heights.
+    alone = np.array(hit.share) == 0.5
+    assert alone.any()
+    places = np.array(hit.values[mesh.bsdf().shell.op.hits])[:, alone].reshape(2, 2, -1)
+    np.testing.assert_array_equal(*places)
     sample, weight = material.sample(context, si, numbers[0], mi.Point2f(*numbers[1:3]))
     null = np.array(mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null))
     reflected = ~null & (np.array(sample.pdf) > 0)
