@@ -91,12 +91,17 @@ def heights_at(z: F64, x: F64, y: F64) -> F64:
     return a + (b - a) * fx + (c - a) * fy + (d - b - c + a) * np.maximum(0, fx + fy - 1)
 
 
-@pytest.mark.parametrize("kappa", [0.2, 1.0, -0.5])
-@pytest.mark.parametrize("inside", [False, True])
-def test_rays_over_a_sphere_meet_what_small_steps_find(kappa: float, inside: bool) -> None:
-    """View rays from the top of the shell, and light that leaves from within, stepped over the sphere."""
+@pytest.mark.parametrize(
+    ("kappa", "inside", "plateau"),
+    [*((kappa, inside, False) for kappa in (0.2, 1.0, -0.5) for inside in (False, True)), (1.0, False, True)],
+)
+def test_rays_over_a_sphere_meet_what_small_steps_find(kappa: float, inside: bool, plateau: bool) -> None:
+    """View rays from the top of the shell, and light that leaves from within, stepped over the sphere. Those
+    that graze a plateau dip between the borders of large blocks."""
     n, steps, random = 300, 8000, np.random.default_rng(3)
     z = rough_heights(16, 16, DEPTH).astype(np.float64)
+    if plateau:
+        z[:], z[0, 0] = -0.1, -DEPTH
     heightfield = HeightField.of(z, 1.0, 1.0, False)
     z = z[::-1]
     up, azimuth = random.uniform(-0.2 if inside else 0.05, 0.95, n), random.uniform(0, 2 * np.pi, n)
