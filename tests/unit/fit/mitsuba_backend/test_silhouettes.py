@@ -167,6 +167,10 @@ def test_rays_meet_the_bottom_over_a_cylinder(turn: F64, scale: Any, aspect: flo
     view = mesh.bsdf()._view(si)
     inside = np.abs(radius * aim) < radius - depth
     assert np.mean((np.array(view.hit.share) > 0.5) == inside) > 0.98
+    missed = np.array(view.hit.share) == 0
+    for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance):
+        value = np.array(mesh.bsdf().eval(mi.BSDFContext(mode), si, mi.Vector3f(0, 0, 1))).max(0)
+        np.testing.assert_array_equal(value == 0, missed)
     # Where the ray meets the cylinder inside, away from its outline.
     clear = np.abs(aim) < 0.8
     t = (9.0 - np.sqrt(np.maximum((radius - depth) ** 2 - origin[1] ** 2, 0.0))) / 0.9
