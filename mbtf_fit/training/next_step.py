@@ -112,7 +112,7 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     if cost.kept_step is not None:
         short = f"the fit overfits noise after {cost.kept_step} steps"
     elif data < FLAT and limit > overfit:
-        known = f"{cost.noise:.0%} of their variance at {cost.density:.0f} per texel"
+        known = f"{cost.noise:.0%} of the variance of values, {cost.density:.3g} queries per texel"
         short = f"noise of the training queries limits the fit ({known})"
     elif data < FLAT:
         short = "the fit overfits noise"

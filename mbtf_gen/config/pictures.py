@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
@@ -79,10 +80,10 @@ class ReferenceSection(ViewSection):
         "both", description="values: M at each pixel's footprint (query), or the filtered image (pixel)"
     )
     surface: Annotated[Shape, Flag("--surface")] = Field(
-        "plane", description="what the material covers; others than the plane show the filtered image"
+        "plane", description="what the material covers; a shape is shown whole by default, path-traced"
     )
     tiles: Annotated[Annotated[int, Field(ge=3, le=1000)], Flag("--tiles-around")] = Field(
-        13, description="tiles around the equator"
+        13, description="tiles around the shape"
     )
 
     @model_validator(mode="after")
@@ -90,6 +91,12 @@ class ReferenceSection(ViewSection):
         if self.surface != "plane" and self.kind == "query":
             raise ValueError(f"a {self.surface} has no pictures of the kind query")
         return self
+
+    def framed(self) -> Self:
+        """With a field of view around a shape where none is given."""
+        if self.surface == "plane" or "tiles_across" in self.model_fields_set:
+            return self
+        return self.model_copy(update={"tiles_across": [float(math.ceil(1.2 * self.tiles / math.pi))]})
 
 
 class PreviewSection(Settings):

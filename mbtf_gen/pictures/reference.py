@@ -6,6 +6,7 @@ A picture is stored as an EXR image with the channels of the shard schema (``u.x
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -23,7 +24,7 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import Queries
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.directions import from_angles
-from mbtf_core.errors import PartialError, check_type
+from mbtf_core.errors import PartialError, UsageError, check_type
 from mbtf_core.files.folders import OutputFolder, check_space, owned
 from mbtf_core.pictures import (
     PIXEL_SIGMA,
@@ -205,8 +206,13 @@ def check_view(job: Job, view: ViewSection, output: Path, kinds: int) -> None:
         len(view.tiles_across) * kinds * _picture_bytes(job, view),
         "reduce --size, or choose another folder with -o",
     )
-    if _shape_of(view) == "plane":
-        cameras_of(view)[0].queries(from_angles(90, 0))
+    camera = min(cameras_of(view), key=lambda c: c.tiles_across)
+    if not isinstance(view, ReferenceSection) or view.surface == "plane":
+        camera.queries(from_angles(90, 0))
+    elif camera.distance <= (radius := view.tiles / (2.0 * np.pi)):
+        least = math.ceil(10.0 * radius * camera.tiles_across / camera.distance) / 10.0
+        what = f"{camera.tiles_across:g} places the camera inside the {view.surface}"
+        raise UsageError(what, where="--tiles-across", hint=f"give more than {least:g}")
 
 
 def note_fine_pixels(cameras: Sequence[Camera], lattice: Lattice, console: Console) -> None:
@@ -271,7 +277,9 @@ def render_missing(
                 raise PartialError(f"picture {done.name} failed: {done.error}", hint=hint)
             image = done.value
             noise = pooled_relative_error(image.value_a.reshape(-1, 3), image.value_b.reshape(-1, 3))
-            facts = {"relative_noise": noise.value, "brightness": brightness(image.value)}
+            # Without light there is no noise.
+            relative = noise.value if image.value.any() else 0.0
+            facts = {"relative_noise": relative, "brightness": brightness(image.value)}
             folder.keep(done.name, [image.write(folder.path / done.name)], facts)
             advance(1)
     return list(missing.values())
@@ -298,10 +306,11 @@ def render_references(
 
     Raises
     ------
-    UsageError : the view shows the horizon
+    UsageError : the view shows the horizon, or the camera is inside the shape
     InputError : the folder holds something else, or the pictures do not fit on the disk
     PartialError : a picture failed; the same command renders the missing ones
     """
+    config = config.model_copy(update={"reference": config.reference.framed()})
     wanted, job = config.reference, Job.load(config)
     job.announce_briefly()
     kinds: tuple[PixelKind, ...] = ("query", "pixel") if wanted.kind == "both" else (wanted.kind,)

@@ -317,9 +317,9 @@ class View:
         found = self.bsdf.evaluator.transmittance(self.u, self.level, ray)
         if self.hit is None:
             return found
-        # Rays pass the back of a shape where they leave its shell, not its inside.
+        # Rays pass the back of a shape where they leave its shell, and through holes.
         return dr.select(
-            self.front, 1.0 - self.hit.share * (1.0 - found), dr.select(self.hit.leaves, 1.0, 0.0)
+            self.front, 1.0 - self.hit.share * (1.0 - found), dr.select(self.hit.leaves, 1.0, found)
         )
 
     def above(self, wo: Vector3f) -> Mask:
@@ -349,7 +349,8 @@ class View:
         evaluator, hit = self.bsdf.evaluator, self.hit
         if hit is None or ctx.mode == mi.TransportMode.Importance:
             values = evaluator.stage1(self.u, self.level, viewer)
-            return evaluator.value(values, light) * dr.maximum(wo.z, 0.0)
+            value = evaluator.value(values, light) * dr.maximum(wo.z, 0.0)
+            return value if hit is None else value * hit.share
         values = evaluator.stage1(self.u, self.level, viewer, hit.values)
         least = self.bsdf.min_cos
         visible = hit.visibility(wo)

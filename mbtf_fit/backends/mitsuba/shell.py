@@ -158,12 +158,14 @@ class Shell:
             for c in (dr.select(hit, place[0], x), dr.select(hit, place[1], y))
         ]
         bend = dr.select(flat, 0.0, s) * tilt(curvature, arc.azimuth)
-        there = dr.select(flat, omega_o, clamped(tilted(omega_o, bend), min_cos))
+        # From behind, the ray meets no heights.
+        still = flat | (omega_o.z <= 0.0)
+        there = dr.select(still, omega_o, clamped(tilted(omega_o, bend), min_cos))
         before = displaced([x, y], -z, there, self.aspect)
         return ShellHit(
             self,
             count / len(found),
-            dr.select(flat, u, mi.Point2f(*before)),
+            dr.select(still, u, mi.Point2f(*before)),
             [dr.select(hit, height, z) for hit, height, *_ in found],
             curvature,
             flat,

@@ -192,13 +192,15 @@ def test_outliers_of_the_prediction_are_named(data: Path) -> None:
     off = 0.02 * (-1.0) ** np.arange(len(truth), dtype=np.float32)[:, None] * np.ones_like(truth)
     off[7] = 4.8
     (u, v), level = stored.u[7], -np.log2(2.0 * stored.sigma[7])
+    light, view = (np.degrees(np.arcsin(w[7, 2])) for w in (stored.omega_i, stored.omega_o))
+    from_where = f"elevations of light {light:.0f}° and view {view:.0f}°"
     for spread, named in ((0.1, True), (4.0, False)):
         a, b = truth.copy(), truth.copy()
         a[7], b[7] = truth[7] + spread, truth[7] - spread
         found = split_errors(lambda q: truth + off, replace(stored, value_a=a, value_b=b), opened)
         assert found is not None
         line = "".join(report_errors({"test": found | {"n": 5000}}, None))
-        for words in ("5.4 predicted for 0.6", f"level {level:.1f}", f"u ({u:.3f}, {v:.3f})"):
+        for words in ("5.4 predicted for 0.6", f"level {level:.1f}", from_where, f"u ({u:.3f}, {v:.3f})"):
             assert (words in line) == named
 
 

@@ -5,14 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.known_surfaces import rough_heights
+from support.known_surfaces import geometry, rough_heights
 from support.plugin_materials import write_material
 from support.plugin_scenes import plane
 from support.scenes import mi
 
+from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import UsageError
 from mbtf_fit.backends.mitsuba import load_scene
 from mbtf_fit.backends.mitsuba.arcs import Arc, trace_arcs
@@ -21,6 +23,8 @@ from mbtf_fit.backends.mitsuba.evaluator import Evaluator
 from mbtf_fit.backends.mitsuba.shade import DirectLight
 from mbtf_fit.backends.mitsuba.shell import tilted
 from mbtf_fit.backends.mitsuba.stored_material import read_material
+from mbtf_fit.material.transmittance import Transmittance
+from mbtf_fit.surface.known import KnownSurface
 from mbtf_gen.pictures.shapes import Chart
 from mbtf_gen.tile.tracers.heightfield import HeightField
 
@@ -90,12 +94,17 @@ def heights_at(z: F64, x: F64, y: F64) -> F64:
     return a + (b - a) * fx + (c - a) * fy + (d - b - c + a) * np.maximum(0, fx + fy - 1)
 
 
-@pytest.mark.parametrize("kappa", [0.2, 1.0, -0.5])
-@pytest.mark.parametrize("inside", [False, True])
-def test_rays_over_a_sphere_meet_what_small_steps_find(kappa: float, inside: bool) -> None:
-    """View rays from the top of the shell, and light that leaves from within, stepped over the sphere."""
+@pytest.mark.parametrize(
+    ("kappa", "inside", "plateau"),
+    [*((kappa, inside, False) for kappa in (0.2, 1.0, -0.5) for inside in (False, True)), (1.0, False, True)],
+)
+def test_rays_over_a_sphere_meet_what_small_steps_find(kappa: float, inside: bool, plateau: bool) -> None:
+    """View rays from the top of the shell, and light that leaves from within, stepped over the sphere. Those
+    that graze a plateau dip between the borders of large blocks."""
     n, steps, random = 300, 8000, np.random.default_rng(3)
     z = rough_heights(16, 16, DEPTH).astype(np.float64)
+    if plateau:
+        z[:], z[0, 0] = -0.1, -DEPTH
     heightfield = HeightField.of(z, 1.0, 1.0, False)
     z = z[::-1]
     up, azimuth = random.uniform(-0.2 if inside else 0.05, 0.95, n), random.uniform(0, 2 * np.pi, n)
@@ -126,10 +135,144 @@ def test_rays_over_a_sphere_meet_what_small_steps_find(kappa: float, inside: boo
         assert np.quantile(np.abs(found - exact[first, lanes])[both], 0.95) < 3e-3
 
 
+TURN = np.array([[np.cos(0.6), -np.sin(0.6)], [np.sin(0.6), np.cos(0.6)]])
+
+
+def sunken(folder: Path, depth: float, aspect: float = 1.0) -> dict[str, Any]:
+    """A material whose heights are all at the bottom."""
+    lattice = Lattice(5, aspect)
+    heights = np.full(lattice.shape(), -depth, np.float32)
+    known = KnownSurface.of(geometry(lattice, heights, color=(0.5,) * 3), lattice, 0.0)
+    write_material(folder, model="relief", finest=5, aspect=aspect, constant=(0.1,) * 3, known=known)
+    return {"type": "mbtf", "material": str(folder), "silhouettes": True}
+
+
+@pytest.mark.parametrize(
+    ("turn", "scale", "aspect"),
+    [(np.eye(2), (1.0, 1.0), 1.0), (TURN, (2.0, 8.0), 0.5), (TURN @ np.diag([-1.0, 1.0]), (3.0, 3.0), 1.0)],
+)
+def test_rays_meet_the_bottom_over_a_cylinder(turn: F64, scale: Any, aspect: float, tmp_path: Path) -> None:
+    """They are a cylinder inside: places, normals, and rays that pass, under any texture coordinates, from
+    before and behind."""
+    depth, chart = 0.1, Chart("cylinder", 6, 1.0)
+    mesh = chart.mesh(None, sunken(tmp_path, depth, aspect) | {"uv_scale": f"{scale[0]},{scale[1]}"}, 32)
+    parameters = mi.traverse(mesh)
+    flat = np.array(parameters["vertex_texcoords"]).reshape(-1, 2) * [1.0, -1.0] + [0.0, 1.0]
+    parameters["vertex_texcoords"] = ((flat @ turn.T) / scale).astype(np.float32).ravel()
+    parameters.update()
+    scene = load_scene({"type": "scene", "mesh": mesh})
+    n, random = 2000, np.random.default_rng(4)
+    radius, aim = chart.radius, random.uniform(-0.98, 0.98, 2000)
+    d = np.array([[0.9], [0.0], [0.43589]]) * np.ones(n)
+    origin = np.array([[-9.0], [0.0], [-4.5]]) + np.array([0 * aim, radius * aim, 0 * aim])
+    ray = mi.Ray3f(*(mi.Vector3f(x.astype(np.float32)) for x in (origin, d)))
+    si = scene.ray_intersect(ray)
+    view = mesh.bsdf()._view(si)
+    inside = np.abs(radius * aim) < radius - depth
+    assert np.mean((np.array(view.hit.share) > 0.5) == inside) > 0.98
+    missed = np.array(view.hit.share) == 0
+    for mode in (mi.TransportMode.Radiance, mi.TransportMode.Importance):
+        value = np.array(mesh.bsdf().eval(mi.BSDFContext(mode), si, mi.Vector3f(0, 0, 1))).max(0)
+        np.testing.assert_array_equal(value == 0, missed)
+    # Where the ray meets the cylinder inside, away from its outline.
+    clear = np.abs(aim) < 0.8
+    t = (9.0 - np.sqrt(np.maximum((radius - depth) ** 2 - origin[1] ** 2, 0.0))) / 0.9
+    x, y, z = (origin + t * d)[:, clear]
+    places = (
+        np.array(view.hit.values[mesh.bsdf().shell.op.hits])[:, clear].reshape(-1, 2, clear.sum()).mean(0)
+    )
+    there = turn @ np.array([np.mod(np.arctan2(y, x), 2 * np.pi) * radius, z])
+    off = places * [[1.0], [aspect]] - (there * [[1.0], [-1.0]] + [[0.0], [aspect]])
+    period = np.array([[1.0], [aspect]])
+    assert np.abs(off - period * np.round(off / period)).max() < 0.02
+    normal = np.array(si.to_world(view.frame.to_local(mi.Vector3f(0, 0, 1))))[:, clear]
+    np.testing.assert_allclose(normal, np.array([x, y, 0 * x]) / (radius - depth), atol=0.02)
+    # The ray leaves the shape where it has missed the bottom.
+    out = scene.ray_intersect(si.spawn_ray(ray.d))
+    passed = np.array(out.bsdf().eval_null_transmission(out))[0]
+    assert np.mean(passed == ~inside) > 0.98
+
+
+def test_sharp_edges_are_rounded(tmp_path: Path) -> None:
+    """To twice the depth of the shell."""
+    shell = mi.load_dict(sunken(tmp_path, 0.1)).shell
+    u, view, sharp = mi.Point2f(0.5, 0.5), mi.Vector3f(0.6, 0.0, 0.8), mi.Vector3f(100.0, 30.0, -80.0)
+    xx, xy, yy = np.array(shell.meet(u, mi.Float(3.0), view, sharp, mi.Float(0.05)).curvature).ravel()
+    assert 0.1 < 0.1 * np.abs(np.linalg.eigvalsh([[xx, xy], [xy, yy]])).max() < 0.5
+
+
+def test_the_shadow_is_that_of_the_heights(tmp_path: Path) -> None:
+    """Of the cylinder inside, on a wall."""
+    chart, turned = Chart("cylinder", 6, 1.0), mi.ScalarTransform4f()
+    wall = turned.translate([4, 0, 0]).rotate([0, 1, 0], -90).scale(9.0)
+    sensor = {
+        "type": "orthographic",
+        "to_world": turned.look_at([2, 0, 0], [4, 0, 0], [0, 0, 1]).scale([1.2, 1.2, 1.0]),
+        "film": {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb"},
+    }
+    white = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 1.0}}
+    scene = load_scene(
+        {
+            "type": "scene",
+            "sensor": sensor,
+            "mesh": chart.mesh(None, sunken(tmp_path, 0.1), 32),
+            "wall": {"type": "rectangle", "to_world": wall, "bsdf": white},
+            "light": {"type": "directional", "direction": [1, 0, 0], "irradiance": 1.0},
+        }
+    )
+    picture = mi.render(scene, integrator=mi.load_dict({"type": "mbtf_path", "max_depth": 2}), spp=64)
+    lit = 1.0 - (chart.radius - 0.1) / 1.2
+    assert np.pi * float(np.array(picture).mean()) == pytest.approx(lit, abs=0.02)
+
+
+def holes(coefficient: float) -> Transmittance:
+    """Holes that are seen differently from all sides."""
+    return Transmittance(Lattice(3), [np.full((2**k, 2**k, 6), coefficient, np.float32) for k in range(4)])
+
+
+@pytest.mark.parametrize("sampling", ["lobes", "cosine"])
+def test_samples_are_those_of_value_and_density(sampling: str, tmp_path: Path) -> None:
+    """Where some rays miss the heights, and others pass holes."""
+    two = {"relief": {"places": 2}}
+    write_material(tmp_path, model="relief", network=two, finest=3, transmittance=holes(0.2))
+    bsdf = {
+        "type": "mbtf",
+        "material": str(tmp_path),
+        "silhouettes": True,
+        "sampling": sampling,
+        "sigma": 0.2,
+    }
+    mesh = Chart("sphere", 8, 1.0).mesh(None, bsdf)
+    scene = load_scene({"type": "scene", "mesh": mesh})
+    aim = np.random.default_rng(5).uniform(0.75, 1.0, 40000).astype(np.float32) * (4 / np.pi)
+    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(-9.0, mi.Float(aim), 0.1), mi.Vector3f(1, 0, 0)))
+    material, context, random = si.bsdf(), mi.BSDFContext(), mi.PCG32(40000)
+    numbers = [random.next_float32() for _ in range(5)]
+    through = material.eval_null_transmission(si).x
+    hit = mesh.bsdf()._view(si).hit
+    # Of two rays one alone meets the heights.
+    alone = np.array(hit.share) == 0.5
+    assert alone.any()
+    places = np.array(hit.values[mesh.bsdf().shell.op.hits])[:, alone].reshape(2, 2, -1)
+    np.testing.assert_array_equal(*places)
+    sample, weight = material.sample(context, si, numbers[0], mi.Point2f(*numbers[1:3]))
+    null = np.array(mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null))
+    reflected = ~null & (np.array(sample.pdf) > 0)
+    value, pdf = material.eval_pdf(context, si, sample.wo)
+    np.testing.assert_allclose(np.array(sample.pdf)[reflected], np.array(pdf)[reflected], rtol=2e-3)
+    expected, found = (np.array(x)[:, reflected] for x in (value, weight * sample.pdf))
+    np.testing.assert_allclose(found, expected, rtol=2e-2, atol=1e-3 * expected.max())
+    assert null.mean() == pytest.approx(float(dr.mean(through)[0]), abs=0.01)
+    around = mi.warp.square_to_uniform_sphere(mi.Point2f(*numbers[3:]))
+    density = 4 * np.pi * np.array(material.pdf(context, si, around))
+    error = density.std() / np.sqrt(density.size)
+    assert reflected.mean() == pytest.approx(density.mean(), abs=4 * error + 0.01)
+
+
 def test_a_plane_looks_as_without_silhouettes(tmp_path: Path) -> None:
-    """Bit for bit."""
-    write_material(tmp_path, model="relief", finest=3)
-    found = []
+    """Bit for bit; holes from both sides."""
+    write_material(tmp_path, model="relief", finest=3, transmittance=holes(0.1))
+    found, passed = [], []
     for silhouettes in (False, True):
         bsdf = {"type": "mbtf", "material": str(tmp_path), "silhouettes": silhouettes}
         scene = load_scene({"type": "scene", "plane": plane(bsdf)})
@@ -139,10 +282,14 @@ def test_a_plane_looks_as_without_silhouettes(tmp_path: Path) -> None:
         si = scene.ray_intersect(ray)
         wo = mi.warp.square_to_uniform_hemisphere(0.5 * mi.Point2f(random[:2]) + 0.5)
         value, pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, wo)
+        back = scene.ray_intersect(mi.Ray3f(ray.o - 2 * towards, towards))
+        passed.append([np.array(si.bsdf().eval_null_transmission(x))[0] for x in (si, back)])
         found.append((np.array(value), np.array(pdf)))
     assert found[0][0].max() > 0
     for flat, curved in zip(*found, strict=True):
         np.testing.assert_array_equal(flat, curved)
+    np.testing.assert_allclose(*passed, atol=1e-6)
+    assert 0 < np.mean(passed) < 1
 
 
 def test_light_from_below_the_plane_is_scattered_once(tmp_path: Path) -> None:

@@ -192,6 +192,8 @@ def test_an_uncertain_error_asks_for_training_queries_where_they_are_too_few(
     test = {"generate.queries.test": "32768", "generate.queries.test_highlights": "75%"}
     more = {"generate.queries.train": "100/texel"} if kind == "queries" else {}
     assert changed == more | test
+    drawn = step.options(FitConfig(), 1.0, {"train": "50/texel", "test": "8192", "test_highlights": 0.5})
+    assert "generate.queries.test_highlights" not in drawn
 
 
 def test_a_fit_that_kept_an_earlier_state_needs_more_queries() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from mbtf_core.app.console import Console
 from mbtf_core.data.shard_files import read_exr
-from mbtf_core.errors import InputError
+from mbtf_core.errors import InputError, UsageError
 from mbtf_core.pictures import read_references, read_value
 from mbtf_gen.config.pictures import ReferenceConfig, Shape
 from mbtf_gen.pictures.reference import render_references
@@ -96,6 +96,25 @@ def test_a_picture_of_a_shape(tmp_path: Path) -> None:
     assert (folder / "sphere-tiles10.png").is_file()
     with pytest.raises(InputError, match="not the plane"):
         read_references(folder)
+
+
+def test_a_shape_is_seen_from_outside(tmp_path: Path) -> None:
+    """Whole by default; a picture without light has no noise."""
+    np.save(tmp_path / "heights.npy", np.zeros((4, 4), np.float32))
+    options = {"surface": "sphere", "tiles": 25, "size": 16, "spp": 2, "view": "30,20", "light": "30,200"}
+    data = {"material": str(tmp_path / "heights.npy"), "reference": options}
+    config = ReferenceConfig.model_validate(data)
+    render_references(config, tmp_path / "whole", Console(quiet=True))
+    seen = read_exr(tmp_path / "whole" / "sphere-tiles10.exr", ("transmittance",))["transmittance"][0]
+    border = np.concatenate([seen[0], seen[-1], seen[:, 0], seen[:, -1]])
+    assert seen.mean() < 0.6
+    assert border.min() > 0.9
+    near = config.model_copy(
+        update={"reference": config.reference.model_copy(update={"tiles_across": [9, 1]})}
+    )
+    with pytest.raises(UsageError, match="inside the sphere") as caught:
+        render_references(near, tmp_path / "near", Console(quiet=True))
+    assert str(caught.value.hint).endswith("1.5")
 
 
 def test_a_shape_has_no_queries() -> None:
