@@ -83,7 +83,7 @@ class ReferenceSection(ViewSection):
         "plane", description="what the material covers; a shape is shown whole by default, path-traced"
     )
     tiles: Annotated[Annotated[int, Field(ge=3, le=1000)], Flag("--tiles-around")] = Field(
-        13, description="tiles around the shape"
+        13, description="tiles around the equator"
     )
 
     @model_validator(mode="after")

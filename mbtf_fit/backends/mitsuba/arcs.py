@@ -4,7 +4,7 @@ The surface is the top of the shell, z = 0. Over the tangent plane of a curved s
 arc. With the normal curvature κ along the ray's azimuth, in 1/tile width and positive where the surface is
 convex, it has at distance t, from a view with the cosine c and the sine q, the position and the height
 
-    s = atan(κ t q / (1 - κ t c)) / κ,    z = t (κ t - 2 c) / (1 + √(1 + κ t (κ t - 2 c))),
+    s = atan2(κ t q, 1 - κ t c) / κ,    z = t (κ t - 2 c) / (1 + √(1 + κ t (κ t - 2 c))),
 
 exact over spheres and across cylinders; to second order ``z = -s c/q + κ s²/2`` at grazing angles, the
 parabola of Oliveira and Policarpo 2005, "An efficient representation for surface details". It ends at the
@@ -107,16 +107,18 @@ class Arc:
     def position(self, t: Float) -> Float:
         """Distances along the surface at distances along the ray."""
         bent = self.curvature * t
-        straight = t * self.sine / dr.maximum(1.0 - bent * self.cosine, 1e-3)
-        x = self.curvature * straight
-        return self.shrinkage * straight * dr.select(dr.abs(x) < 1e-3, 1.0 - x * x / 3.0, dr.atan(x) / x)
+        below = 1.0 - bent * self.cosine
+        angle = dr.atan2(bent * self.sine, below)
+        near = t * self.sine / dr.maximum(below, 1e-3) * (1.0 - angle * angle / 3.0)
+        return self.shrinkage * dr.select(dr.abs(angle) < 1e-3, near, angle / self.curvature)
 
     def distance(self, s: Float) -> Float:
         """Inverse of :meth:`position`."""
         s = s / self.shrinkage
-        angle = dr.clip(self.curvature * s, -1.5, 1.5)
-        chord = s * dr.select(dr.abs(angle) < 1e-3, 1.0 + angle * angle / 3.0, dr.tan(angle) / angle)
-        return chord / (self.sine + self.curvature * chord * self.cosine)
+        angle = dr.clip(self.curvature * s, -3.0, 3.0)
+        sin, cos = dr.sincos(angle)
+        chord = s * dr.select(dr.abs(angle) < 1e-3, 1.0 - angle * angle / 6.0, sin / angle)
+        return chord / (self.sine * cos + self.curvature * chord * self.cosine)
 
     def height(self, t: Float) -> Float:
         """Heights at distances along the ray."""

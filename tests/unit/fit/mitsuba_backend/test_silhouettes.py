@@ -96,7 +96,10 @@ def heights_at(z: F64, x: F64, y: F64) -> F64:
 
 @pytest.mark.parametrize(
     ("kappa", "inside", "plateau"),
-    [*((kappa, inside, False) for kappa in (0.2, 1.0, -0.5) for inside in (False, True)), (1.0, False, True)],
+    [
+        *((kappa, inside, False) for kappa in (0.2, 1.0, -0.5) for inside in (False, True)),
+        (1.0, False, True),
+    ],
 )
 def test_rays_over_a_sphere_meet_what_small_steps_find(kappa: float, inside: bool, plateau: bool) -> None:
     """View rays from the top of the shell, and light that leaves from within, stepped over the sphere. Those
@@ -191,6 +194,18 @@ def test_rays_meet_the_bottom_over_a_cylinder(turn: F64, scale: Any, aspect: flo
     out = scene.ray_intersect(si.spawn_ray(ray.d))
     passed = np.array(out.bsdf().eval_null_transmission(out))[0]
     assert np.mean(passed == ~inside) > 0.98
+
+
+@pytest.mark.parametrize("kappa", [2.0, 1e-5, -1.0])
+def test_arcs_end_where_rays_over_a_sphere_do(kappa: float) -> None:
+    """Also beyond a quarter of the sphere."""
+    c, up = np.linspace(0.05, 0.95, 19), np.zeros(19)
+    d = mi.Vector3f(np.stack([np.sqrt(1 - c**2), up, -c]).astype(np.float32))
+    arc = Arc.of(d, mi.Vector3f(kappa, 0.0, kappa), mi.Float(DEPTH), 64.0)
+    t = np.array(arc.last, np.float64)
+    expected = np.arctan2(kappa * t * np.sqrt(1 - c**2), 1 - kappa * t * c) / kappa
+    np.testing.assert_allclose(np.array(arc.end), expected, rtol=1e-4)
+    np.testing.assert_allclose(np.array(arc.distance(arc.end)), t, rtol=1e-4)
 
 
 def test_sharp_edges_are_rounded(tmp_path: Path) -> None:

@@ -136,7 +136,7 @@ def test_a_study_keeps_its_time_and_resumes(fake: FakeRuns, tmp_path: Path) -> N
 
     def measured(**options: Any) -> tuple[module.Study, list[Run]]:
         fake.measured.clear()
-        return module.run_study(recipe, folder, **options), [*fake.measured]  # type: ignore[arg-type]
+        return module.run_study(recipe, folder, **options), [*fake.measured]
 
     # Two runs of 60 s and one of 40 s.
     shares = list[float]()
