@@ -126,7 +126,7 @@ def _remarks(errors: Mapping[str, Any], foreign: bool) -> list[str]:
     found, split = [], errors[headline(errors)]
     value, measured = split["unexplained"]["value"], bool(split.get("includes_noise"))
     if value is None:
-        why = "these values do not vary" if measured else "the noise exceeds the variance of these values"
+        why = "these values do not vary" if measured else "few bright values, or noise, decide the variance"
         found.append(f"undefined unexplained variance: {why}")
     if measured:
         found.append("these errors include the noise of the data, which have one value per query")
@@ -153,7 +153,7 @@ def _table_of(errors: Mapping[str, Any]) -> list[str]:
         return []
     rows = [row for row in rows if row[0] == "all" or {*row[1:]} != {"-"}]
     partial = any("-" in row for row in rows)
-    why = ["-: too few queries, or values that vary less than their noise"] if partial else []
+    why = ["-: too few queries, or few bright values or noise decide the variance"] if partial else []
     why += [f"{SPLIT_NAMES.get(k, k)} {text}" for k, s in errors.items() if (text := unreliable(s))]
     rows.append(["queries", *(str(split["n"]) for split in splits)])
     names = ["unexplained variance", *(SPLIT_NAMES.get(name, name) for name in errors)]

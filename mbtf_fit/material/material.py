@@ -76,6 +76,8 @@ def _numbers(values: ArrayLike, name: str) -> NDArray[np.float32]:
     wrong = np.isnan(found) if name == "sigma" else ~np.isfinite(found)
     if bad := int(wrong.sum()):
         raise InputError(f"holds NaN or infinity ({bad} of {found.size} numbers)", where=name)
+    if name == "sigma" and (bad := int((found < 0).sum())):
+        raise InputError(f"is negative ({bad} of {found.size} numbers)", where=name)
     return found
 
 

@@ -50,10 +50,14 @@ def describe_kept(history: Sequence[dict[str, Any]], kept: int | None) -> str | 
     if best is None:
         return None
     last = history[-1]
-    text = (
-        f"validation error rose from {best['unexplained']:.2g} after {kept} steps to "
-        f"{last['unexplained']:.2g} after {last['step']}: kept the state after {kept} steps"
-    )
+    first, then = best["unexplained"], last["unexplained"]
+    text = f"kept the state after {kept} steps"
+    # Few test queries may leave the errors undefined, though not their change.
+    if first is None or then is None:
+        text = f"validation error rose between steps {kept} and {last['step']}: {text}"
+    else:
+        rise = f"rose from {first:.2g} after {kept} steps to {then:.2g} after {last['step']}"
+        text = f"validation error {rise}: {text}"
     share = math.ceil(20.0 * best["step"] / last["step"]) / 20.0
     return f"{text}; {share:.0%} of the time suffices" if share <= _SHORTER else text
 

@@ -153,10 +153,11 @@ def _flags(options: Mapping[str, str], section: str) -> list[str]:
 
 
 def _numbered(folder: str) -> str:
-    """Name of the next folder: ``material-2`` after ``material``, ``material-10`` after ``material-9``, but
-    ``rock-16-2`` after ``rock-16``: numbers from 16 are resolutions."""
+    """Name of the next free folder: ``material-2`` after ``material``, ``material-10`` after ``material-9``,
+    but ``rock-16-2`` after ``rock-16``: numbers from 16 are resolutions."""
     stem, digits = re.fullmatch(r"(.*?)(?:-([2-9]|1[0-5]))?/*", folder, re.DOTALL).groups()  # type: ignore[union-attr]
-    return f"{stem}-{int(digits or 1) + 1}"
+    name = f"{stem}-{int(digits or 1) + 1}"
+    return _numbered(name) if Path(name).exists() else name
 
 
 def _times_as_long(planned: float, spent: float, factor: int) -> str:

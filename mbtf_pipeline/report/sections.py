@@ -139,7 +139,7 @@ def _grouping(
         return None
     labels = {name: name.replace("-", "–") for name in names}
     unknown = ", ".join(labels[name] for name in names if name not in known)
-    why = "too few queries, or values that vary less than their noise"
+    why = "too few queries, or few bright values or noise decide the variance"
     note = f"Without {unknown}: {why}." if unknown else ""
     series: dict[str, list[tuple[float, float] | None]] = {fit: [] for fit in tests}
     rows = []

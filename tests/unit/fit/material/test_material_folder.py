@@ -273,6 +273,7 @@ def test_evaluation_broadcasts_as_numpy_does(fitted: FitResult) -> None:
         ("sigma", [[0.1], [0.1, 0.2]], "no array of real numbers"),
         ("u", [0.5, np.nan], r"NaN or infinity \(1 of 2"),
         ("sigma", np.nan, r"NaN or infinity \(1 of 1"),
+        ("sigma", [0.1, -1.0], r"is negative \(1 of 2"),
         ("u", np.zeros((5, 1)), "have the shapes"),
         ("u", 0.5, "have the shapes"),
         ("u", np.zeros(3), "have the shapes"),

@@ -217,6 +217,9 @@ def test_an_early_best_state_suggests_a_shorter_time() -> None:
     assert str(describe_kept(records, 1024)).endswith("30% of the time suffices")
     assert str(describe_kept(records, 3500)).endswith("kept the state after 3500 steps")
     assert describe_kept(records, None) is None
+    # Few test queries leave errors undefined.
+    unknown = [{**record, "unexplained": None} for record in records]
+    assert "kept the state after 1024 steps" in str(describe_kept(unknown, 1024))
 
 
 def test_the_next_command_is_complete(tmp_path: Path) -> None:
