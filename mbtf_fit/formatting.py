@@ -23,8 +23,8 @@ VISIBILITY = (
     (-math.inf, "clearly visible"),
 )
 ABOVE_ONE = "above 1: worse than the mean value"
-# Share of an error that ten of so many queries at least make up. At 0.39, the error of glossy bricks at 65 536
-# queries was half of that at four million, six of its standard errors below.
+# Share of an error that ten of so many queries at least make up. At 0.39, the error of glossy bricks at
+# 65 536 queries was half of that at four million, six of its standard errors below.
 _DECISIVE, _MANY = 1 / 3, 1000
 # Share of an error from which its outliers are named.
 _OUTLYING = 0.25
