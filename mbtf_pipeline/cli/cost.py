@@ -38,9 +38,9 @@ def cost(
 ) -> None:
     """Measure error against time for this material and machine.
 
-    Writes cost.html, cost.csv and PNGs: the errors of complete runs, and, if --dry-run says so, a forecast for
-    up to four times as long. The same command resumes. A longer time keeps all measurements and adds longer runs.
-    With --cluster, workers measure, each for itself.
+    Writes cost.html, cost.csv and PNGs: the errors of complete runs, and, if --dry-run says so, a forecast
+    for up to four times as long. The same command resumes. A longer time keeps all measurements and adds
+    longer runs. With --cluster, workers measure, each for itself.
 
     Parameters
     ----------
