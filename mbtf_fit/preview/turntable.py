@@ -26,6 +26,7 @@ from mbtf_core.run.signals import reinstall_handlers
 from mbtf_fit.backends.mitsuba.stored_material import F32
 from mbtf_fit.preview.config import TurntableSection
 from mbtf_gen.engine.types import BSDF, Scene
+from mbtf_gen.pictures.shapes import mitsuba_mesh
 
 # Latitude beyond which the projection continues with constant scale.
 STEEPEST = np.radians(84.0)
@@ -60,7 +61,9 @@ def ball(bsdf: BSDF, tiles: int) -> Any:
     corner = np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)
     right, below = corner + 1, corner + columns + 1
     faces = np.stack([corner, below, below + 1, corner, below + 1, right], -1).reshape(-1, 3)
-    return _mesh("ball", bsdf, position.reshape(-1, 3), uv.reshape(-1, 2), faces, position.reshape(-1, 3))
+    return mitsuba_mesh(
+        "ball", bsdf, position.reshape(-1, 3), uv.reshape(-1, 2), faces, position.reshape(-1, 3)
+    )
 
 
 def plate(bsdf: BSDF, tiles: int) -> Any:
@@ -71,28 +74,7 @@ def plate(bsdf: BSDF, tiles: int) -> Any:
     uv = flat * (1.0, -1.0) * (tiles / (2.0 * np.pi))
     rim = np.arange(CELLS[0])
     faces = np.stack([np.zeros_like(rim), 1 + rim, 1 + (rim + 1) % CELLS[0]], -1)
-    return _mesh("plate", bsdf, position, uv, faces)
-
-
-def _mesh(name: str, bsdf: BSDF, position: Any, uv: Any, faces: Any, normals: Any = None) -> Any:
-    properties = mi.Properties()
-    properties["bsdf"] = bsdf
-    mesh = mi.Mesh(
-        name,
-        len(position),
-        len(faces),
-        has_vertex_normals=normals is not None,
-        has_vertex_texcoords=True,
-        props=properties,
-    )
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = position.astype(np.float32).ravel()
-    parameters["vertex_texcoords"] = uv.astype(np.float32).ravel()
-    parameters["faces"] = faces.astype(np.uint32).ravel()
-    if normals is not None:
-        parameters["vertex_normals"] = normals.astype(np.float32).ravel()
-    parameters.update()
-    return mesh
+    return mitsuba_mesh("plate", bsdf, position, uv, faces)
 
 
 def _transforms(turned: float) -> dict[str, Any]:

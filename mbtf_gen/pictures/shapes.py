@@ -116,34 +116,42 @@ class Chart:
         uv = np.stack(np.broadcast_arrays(x[None], 1.0 - y[:, None] / self.aspect), -1)
         # Rows of :func:`grid_faces` run downwards.
         order = slice(None, None, -1)
-        return _mesh(p[order], uv[order], None if grid is not None else n[order], bsdf)
+        import mitsuba as mi
+
+        faces, normals = grid_faces(*p.shape[:2]), None if grid is not None else n[order].reshape(-1, 3)
+        material = mi.load_dict(bsdf) if isinstance(bsdf, dict) else bsdf
+        position, texture = p[order].reshape(-1, 3), uv[order].reshape(-1, 2)
+        return mitsuba_mesh("shape", material, position, texture, faces, normals, flat=normals is None)
 
 
 def _around(azimuth: F64, radius: F64, z: F64) -> F64:
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], -1)
 
 
-def _mesh(p: F64, uv: F64, n: F64 | None, bsdf: Any) -> Any:
+def mitsuba_mesh(
+    name: str, bsdf: Any, position: F64, uv: F64, faces: Any, normals: F64 | None = None, flat: bool = False
+) -> Any:
+    """A mesh of Mitsuba, of vertices (n, 3), uv (n, 2) and triangles (m, 3), with vertex normals (n, 3) or
+    `flat` ones of faces."""
     import mitsuba as mi
 
     props = mi.Properties()
-    props["bsdf"] = mi.load_dict(bsdf) if isinstance(bsdf, dict) else bsdf
-    props["face_normals"] = n is None
-    faces = grid_faces(*p.shape[:2])
+    props["bsdf"] = bsdf
+    props["face_normals"] = flat
     mesh = mi.Mesh(
-        "shape",
-        p.shape[0] * p.shape[1],
+        name,
+        len(position),
         len(faces),
-        has_vertex_normals=n is not None,
+        has_vertex_normals=normals is not None,
         has_vertex_texcoords=True,
         props=props,
     )
     parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = p.astype(np.float32).ravel()
+    parameters["vertex_positions"] = position.astype(np.float32).ravel()
     parameters["vertex_texcoords"] = uv.astype(np.float32).ravel()
-    parameters["faces"] = faces.ravel()
-    if n is not None:
-        parameters["vertex_normals"] = n.astype(np.float32).ravel()
+    parameters["faces"] = faces.astype(np.uint32).ravel()
+    if normals is not None:
+        parameters["vertex_normals"] = normals.astype(np.float32).ravel()
     parameters.update()
     return mesh
 
