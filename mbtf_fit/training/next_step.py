@@ -30,7 +30,6 @@ _NO_GAIN = "neither twice the training nor twice the queries would reduce the er
 _FLAGS = {
     "generate.queries.train": "--queries",
     "generate.queries.test": "--test-queries",
-    "generate.queries.test_highlights": "--test-highlights",
     "fit.training.time": "--time",
     "fit.training.steps": "--steps",
 }
@@ -64,7 +63,6 @@ class NextStep:
         more = {"generate.queries.train": _times(queries["train"], 2)} if self.kind == "queries" else {}
         if self.kind == "test" or self.test:
             more["generate.queries.test"] = _times(queries["test"], 4)
-            more |= {} if queries.get("test_highlights") else {"generate.queries.test_highlights": "75%"}
         return more
 
     def command(
@@ -120,7 +118,7 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
         is_less = value - own > max(0.5 * value, _SIGNIFICANT * math.hypot(error, spread))
         short = "the error of training queries is less than half as large" if is_less else ""
     if value is None or error is None or error > _UNCERTAIN * abs(value) or unreliable(split):
-        better = "four times as many, by highlights, measure it better"
+        better = "four times as many measure it better"
         if not short:
             return NextStep("test", f"few test queries decide the error; {better}")
         reason = f"{short}; twice the queries reduce the error; few test queries decide it: {better}"

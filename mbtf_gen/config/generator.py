@@ -182,13 +182,13 @@ class QueriesSection(Settings):
         256, description="mean number of paths per test query, both estimates together (even)"
     )
     test_highlights: Annotated[
-        float, BeforeValidator(_share), Flag("--test-highlights", "75%", rare=True)
+        float | None, BeforeValidator(_share), Flag("--test-highlights", "75%", rare=True)
     ] = Field(
-        0.0,
+        None,
         ge=0,
         le=0.95,
         description="share of test queries drawn where highlights are, with weights that keep errors "
-        "unbiased; glossy materials need fewer",
+        "unbiased; default: 75% if a pilot shows that it pays, else 0",
     )
     lights_per_path: Annotated[int, Flag("--lights-per-path", rare=True)] = Field(
         1,

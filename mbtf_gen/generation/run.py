@@ -186,7 +186,7 @@ class ShardRun:
         plan, highlights = self.job.query_plan, self.plan.highlights
         if entry.split == "train" or highlights is None:
             return plan.draw(entry.split, entry.index, entry.rows), None
-        return highlights.draw(plan, self.job.config.queries.test_highlights, entry.index, entry.rows)
+        return highlights.draw(plan, entry.index, entry.rows)
 
     def store(
         self,

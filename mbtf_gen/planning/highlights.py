@@ -15,6 +15,9 @@ the mirror direction of the view on the reference plane. The probability of a se
 times the ratio of p to the candidates' density; none is selected twice (systematic sampling, Madow 1949).
 Where that would exceed 1, all candidates are selected, with weights that their own density gives.
 Footprints and directions decide, so positions are drawn afterwards, as without selection.
+
+By default the pilot also decides whether that pays. Squared errors of about g have over n queries a mean of
+variance E_p[g²]/n about, and E_p[g²/s]/n with weights; their ratio is the gain in queries.
 """
 
 from __future__ import annotations
@@ -50,6 +53,8 @@ PILOT_SPP, PILOT_SHARE = 8, 0.25
 PILOT_LEAST, PILOT_MOST = 1 << 12, 1 << 15
 # The moment of M that is fitted.
 _MOMENT = 3.0
+# By default: the share a, and the gain from which it pays.
+DEFAULT_SHARE, WORTHWHILE = 0.75, 3.0
 
 
 @dataclass(frozen=True)
@@ -59,22 +64,34 @@ class Highlights:
     Attributes
     ----------
     weights : of the polynomial's terms in footprint and directions, for ln g
+    share : a, in (0, 1)
     """
 
     weights: tuple[float, ...]
+    share: float = DEFAULT_SHARE
 
     def density(self, footprints: Footprints) -> F64:
         """g (n,) of footprints and directions, (1/sr)²."""
         queries = Queries(np.empty((0, 2), np.float32), *footprints)
         return evaluate_terms(self.weights, direction_terms(queries))
 
-    def draw(self, plan: QueryPlan, share: float, shard: int, rows: int) -> tuple[Queries, F32]:
+    def gain(self, queries: Queries) -> float:
+        """How many times as many queries of the distribution p, of which some are given, measure the error
+        of a fit as well as queries drawn by highlights."""
+        g = self.density((queries.sigma, queries.omega_i, queries.omega_o))
+        square = g * g
+        return float(np.mean(square) / np.mean(square / self._score(g, float(g.mean()))))
+
+    def _score(self, g: F64, mean: float) -> F64:
+        """s (n,) for values of g and their mean over p."""
+        return np.ones(len(g)) if mean <= 0 else (1.0 - self.share) + self.share * g / mean
+
+    def draw(self, plan: QueryPlan, shard: int, rows: int) -> tuple[Queries, F32]:
         """Sample the test queries of a shard, and their weights.
 
         Parameters
         ----------
         plan : sampler of the run's queries
-        share : a, in [0, 1)
         shard, rows : of the test split, as :meth:`~mbtf_gen.sampling.query_sampler.QueryPlan.draw` takes them
 
         Returns
@@ -87,8 +104,7 @@ class Highlights:
         ends = [rows * part // count for part in range(count + 1)]
         # One part of the candidates at a time, for their memory.
         parts = [
-            self._select(generator, plan, share, max(rows, FEWEST), stop - start)
-            for start, stop in pairwise(ends)
+            self._select(generator, plan, max(rows, FEWEST), stop - start) for start, stop in pairwise(ends)
         ]
         sigma, omega_i, omega_o, weight = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         queries = plan.place(generator, "test", shard, (sigma, omega_i, omega_o))
@@ -96,7 +112,7 @@ class Highlights:
         return queries, np.broadcast_to(weight.reshape(shape), queries.lead).copy()
 
     def _select(
-        self, generator: np.random.Generator, plan: QueryPlan, share: float, total: int, count: int
+        self, generator: np.random.Generator, plan: QueryPlan, total: int, count: int
     ) -> tuple[F32, F32, F32, F32]:
         """Footprints, directions and weights of `count` of `total` candidates."""
         sigma, omega_i, omega_o = plan.footprints(generator, total)
@@ -108,8 +124,7 @@ class Highlights:
         ratio = 1.0 / (0.5 + 0.5 * _mirror_density(omega_i, omega_o) * math.pi * radius**2)
         ratio[1::2] *= inside
         g = self.density(footprints)
-        mean = _total(ratio * g) / _total(ratio)
-        score = np.ones(total) if mean <= 0 else (1.0 - share) + share * g / mean
+        score = self._score(g, _total(ratio * g) / _total(ratio))
         chance = inclusion(ratio * score, count)
         ends = np.cumsum(chance)
         at = (generator.random() + np.arange(count)) * (ends[-1] / count)
@@ -160,23 +175,32 @@ def inclusion(size: F64, count: int) -> F64:
         certain |= above
 
 
-def fit_highlights(queries: Queries, value: F64) -> Highlights | None:
-    """Highlights from a pilot's queries (one leading axis) and their mean values (n,); None if the fit does
-    not converge, with a warning."""
+def fit_highlights(queries: Queries, value: F64, share: float) -> Highlights | None:
+    """Highlights from a pilot's queries (one leading axis) and their mean values (n,), for a share a; None if
+    the fit does not converge."""
     weights = fit_log_linear(direction_terms(queries), value**_MOMENT)
-    if weights is None:
-        log.warning("the fit of highlights over directions did not converge; test queries are uniform")
-        return None
-    return Highlights(tuple((weights * (2.0 / _MOMENT)).tolist()))
+    return None if weights is None else Highlights(tuple((weights * (2.0 / _MOMENT)).tolist()), share)
 
 
 def measure_highlights(job: Job, plan: EffectsPlan, tiles: dict[frozenset[str], Any]) -> Highlights | None:
-    """Highlights of a job under an effects plan, by a pilot with its own random numbers; `tiles` as of
-    :func:`~mbtf_gen.planning.simulation.build_estimator`."""
-    paths = split_queries(job, "test") * job.config.queries.test_spp
-    count = min(max(int(PILOT_SHARE * paths / PILOT_SPP), PILOT_LEAST), PILOT_MOST)
-    queries = pilot_queries(job, count, 2)
+    """Highlights of a job under an effects plan, by a pilot with its own random numbers; None where test
+    queries have the distribution of all.
+
+    By default, that is where the pilot would cost more than its share of the paths of the test queries, and
+    where it finds that highlights do not decide. `tiles` as of
+    :func:`~mbtf_gen.planning.simulation.build_estimator`.
+    """
+    given = job.config.queries.test_highlights
+    affordable = int(PILOT_SHARE * split_queries(job, "test") * job.config.queries.test_spp / PILOT_SPP)
+    if given == 0 or (given is None and affordable < PILOT_LEAST):
+        return None
+    queries = pilot_queries(job, min(max(affordable, PILOT_LEAST), PILOT_MOST), 2)
     # Shards 0 and 1 are those of the pilots of effects and of the allocation.
     stream = Stream(job.config.seed, "pilot", 2)
     estimates = build_estimator(job, plan, tiles).estimate(queries, PILOT_SPP, stream)
-    return fit_highlights(queries, mean_values(estimates))
+    found = fit_highlights(queries, mean_values(estimates), DEFAULT_SHARE if given is None else given)
+    if given is not None and found is None:
+        log.warning("the fit of highlights over directions did not converge; test queries are uniform")
+    if found is None or (given is None and found.gain(queries) < WORTHWHILE):
+        return None
+    return found

@@ -76,7 +76,7 @@ def plan_run(job: Job, note: Callable[[str], None] = lambda phase: None) -> RunP
 
 def allocate(job: Job, effects: EffectsPlan) -> RunPlan:
     """The plan of a run that simulates given effects; pilots allocate the paths under a target error and
-    where that pays, and find the highlights where test queries are to have them."""
+    where that pays, and find the highlights by which test queries are drawn."""
     queries = job.config.queries
     if effects.closed_form:
         return RunPlan(effects)
@@ -86,7 +86,7 @@ def allocate(job: Job, effects: EffectsPlan) -> RunPlan:
     return RunPlan(
         effects,
         measure_allocation(job, effects, tiles) if needed else None,
-        measure_highlights(job, effects, tiles) if queries.test_highlights else None,
+        measure_highlights(job, effects, tiles),
     )
 
 

@@ -1,7 +1,7 @@
 """One run of the whole chain: training data of a size, a fit of a length, and its error on a test set.
 
-All runs are evaluated on the same test set, which no fit is trained on: many queries of few paths, most of
-them drawn by the highlights. With halves a, b of its values and a prediction p, ``E[(p - a)(p - b)]`` is the
+All runs are evaluated on the same test set, which no fit is trained on: many queries of few paths, drawn by
+highlights where these decide. With halves a, b of its values and a prediction p, ``E[(p - a)(p - b)]`` is the
 squared error of p, free of the noise of the test values. Its error bar depends on the number of queries more
 than on that of paths. Data and fits come from the generator and the fitter, called as the programs call them.
 While a run trains, the test set also gives the errors that it would have if it were stopped.
@@ -59,9 +59,8 @@ SLOW_SERIES = f"{FEWEST_STEPS} training steps"
 # Fewest total times that tell how the error falls, and the study's seconds in which they are measured.
 FEWEST_TOTALS = 3
 LEAST_SECONDS = SHORTEST * (2**FEWEST_TOTALS - 1 + 2 ** (FEWEST_TOTALS - 1) - 1) / RUNS
-# Test queries, and paths of each; a share of them is drawn by the highlights, which decide glossy errors.
+# Test queries, and paths of each.
 TEST = (1 << 18, 16)
-_HIGHLIGHTS = 0.75
 # The smallest split that the generator takes.
 _NO_QUERIES = (1, 2)
 # Pixels of a 1080p image with one query each; queries of one timed evaluation, and how often it is timed.
@@ -245,7 +244,7 @@ def _generated(
 ) -> tuple[Path, float]:
     """Folder of a new data set with (queries, paths of each) of both splits, and the seconds it took."""
     queries = {"train": str(train[0]), "spp": train[1], "test": str(test[0]), "test_spp": test[1]}
-    queries |= {"test_highlights": _HIGHLIGHTS if test == TEST else 0.0}
+    queries |= {"test_highlights": 0.0} if test == _NO_QUERIES else {}
     changes = {"seed": conditions.config.seed + seed, "queries": {**queries, "layout": "shuffled"}}
     data = deep_merge(conditions.config.model_dump(mode="json"), changes)
     folder = _own_folder(conditions) / f"data-{data_sha256(data)[:12]}"

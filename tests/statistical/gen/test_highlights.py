@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,11 +58,11 @@ def truth() -> dict[str, float]:
 def plane() -> Highlights:
     """Highlights of the plane, from a pilot of its values."""
     pilot = PLAN.draw("pilot", 0, 8192)
-    return fit_highlights(pilot, value_of(pilot))
+    return fit_highlights(pilot, value_of(pilot), SHARE)
 
 
 def drawn(highlights: Highlights) -> tuple[Queries, F64]:
-    parts = [highlights.draw(PLAN, SHARE, shard, ROWS) for shard in range(SHARDS)]
+    parts = [highlights.draw(PLAN, shard, ROWS) for shard in range(SHARDS)]
     arrays = ([getattr(q, name) for q, _ in parts] for name in ("u", "sigma", "omega_i", "omega_o"))
     queries = Queries(*map(np.concatenate, arrays))
     return queries, np.concatenate([w for _, w in parts]).astype(np.float64)
@@ -77,7 +78,7 @@ def test_weighted_means_are_those_by_quadrature(
     other = np.zeros(len(plane.weights))
     other[4], other[6], other[2] = 1.0, 2.0, -0.5
     weights = {"its own": plane.weights, "constant": (0.0,) * len(other), "of another material": tuple(other)}
-    q, w = drawn(Highlights(weights[kind]))
+    q, w = drawn(Highlights(weights[kind], SHARE))
     m, p = value_of(q), value_of(q, 0.25)
     for found, expected in ((m, truth["mean"]), ((p - m) ** 2, truth["mse"])):
         assert t_test(mean_estimate(found, w), expected).p_value > 1e-3
@@ -98,12 +99,14 @@ def test_weighted_means_are_those_by_quadrature(
 
 
 def test_few_queries_reach_the_error(plane: Highlights) -> None:
-    """The variance of an error is less than a tenth of that of uniform queries."""
+    """The variance of an error is less than a tenth of that of uniform queries, as the pilot says."""
     q, w = drawn(plane)
     uniform = PLAN.draw("train", 0, len(w))
     weighted = mean_estimate((value_of(q) - value_of(q, 0.25)) ** 2, w)
     plain = mean_estimate((value_of(uniform) - value_of(uniform, 0.25)) ** 2)
     assert weighted.error < plain.error / np.sqrt(10)
+    assert plane.gain(uniform) > 10
+    assert Highlights((0.3, *[0.0] * (len(plane.weights) - 1))).gain(uniform) == pytest.approx(1)
     # No query is counted twice, which would make error bars too small.
     assert len(np.unique(q.omega_i, axis=0)) == len(w)
 
@@ -119,19 +122,24 @@ def test_probabilities_of_selection() -> None:
 
 
 def test_a_rendered_test_set_has_the_error_of_a_plain_one(tmp_path: Path) -> None:
-    """Means and errors of a model agree, and the test set by highlights resolves the error far better."""
+    """Means and errors of a model agree, and the test set by highlights, the default of a glossy material,
+    resolves the error far better. Few queries, and those of a matte material, are plain."""
     np.save(tmp_path / "height.npy", 0.02 * np.random.default_rng(0).random((8, 8)))
     text = "height: height.npy\nbase_color: 0.8\nmetallic: 1\nroughness: 0.4\n"
     (tmp_path / "material.yaml").write_text(text)
     found: list[tuple[Estimate, Estimate]] = []
-    for share in (0.0, SHARE):
-        queries = {"train": "16", "test": "8192", "test_spp": 4, "test_highlights": share}
-        config = GeneratorConfig(material=str(tmp_path), queries=queries, output={"shard_queries": 4096})
-        generate(config, tmp_path / f"{share}")
-        data = Dataset.open(tmp_path / f"{share}")
-        assert data.weighted == (share > 0)
+
+    def data_of(name: str, **queries: Any) -> Dataset:
+        options = {"train": "16", "test": "8192", "test_spp": 16, **queries}
+        config = GeneratorConfig(material=str(tmp_path), queries=options, output={"shard_queries": 4096})
+        generate(config, tmp_path / name)
+        return Dataset.open(tmp_path / name)
+
+    for name, options in (("plain", {"test_highlights": 0}), ("drawn", {})):
+        data = data_of(name, **options)
+        assert data.weighted == (name == "drawn")
         test = data.load("test")
-        assert (test["spp"] == 4).all()
+        assert (test["spp"] == 16).all()
         assert "weight" not in data.load("train")
         a, b, w = test["value_a"], test["value_b"], test.get("weight")
         model = value_of(Queries(*(test[k] for k in ("u", "sigma", "omega_i", "omega_o"))), 0.3)
@@ -140,3 +148,6 @@ def test_a_rendered_test_set_has_the_error_of_a_plain_one(tmp_path: Path) -> Non
     for plain, drawn in zip(*found, strict=True):
         assert t_test(plain, drawn).p_value > 1e-3
     assert found[1][1].error < 0.4 * found[0][1].error
+    assert not data_of("few", test="4096").weighted
+    (tmp_path / "material.yaml").write_text("height: height.npy\nbase_color: 0.8\n")
+    assert not data_of("matte").weighted

@@ -16,7 +16,7 @@ from mbtf_fit.cli.advice import advise
 CONFIG: dict[str, Any] = {
     "material": "bricks",
     "light": {"width": 1.0},
-    "queries": {"train": "100/texel", "test": "8192", "test_highlights": 0.0, "min_cos": 0.1},
+    "queries": {"train": "100/texel", "test": "8192", "min_cos": 0.1},
 }
 
 

@@ -189,11 +189,9 @@ def test_an_uncertain_error_asks_for_training_queries_where_they_are_too_few(
     assert step.kind == kind
     # One command makes both.
     changed = step.options(FitConfig(), 1.0, {"train": "50/texel", "test": "8192"})
-    test = {"generate.queries.test": "32768", "generate.queries.test_highlights": "75%"}
+    test = {"generate.queries.test": "32768"}
     more = {"generate.queries.train": "100/texel"} if kind == "queries" else {}
     assert changed == more | test
-    drawn = step.options(FitConfig(), 1.0, {"train": "50/texel", "test": "8192", "test_highlights": 0.5})
-    assert "generate.queries.test_highlights" not in drawn
 
 
 def test_a_fit_that_kept_an_earlier_state_needs_more_queries() -> None:
@@ -242,7 +240,7 @@ def test_the_next_command_is_complete(tmp_path: Path) -> None:
     made = "mbtf-gen 'wool maps' --config shards/config.yaml"
     again = f"mbtf-fit shards-2 {fitted} -o material-2"
     assert command("queries") == f"{made} --queries 100/texel -o shards-2 && {again}"
-    more = "--queries 1 --test-queries 32768 --test-highlights 75%"
+    more = "--queries 1 --test-queries 32768"
     assert command("test") == f"{made} {more} -o shards-2 && mbtf-fit evaluate material shards-2"
     # Data of other test queries alone: the training queries are made again.
     for kind, train, time in (("queries", "400/texel", ""), ("time", "200/texel", " --time 1min")):

@@ -19,12 +19,12 @@ from mbtf_gen.generation.folder import read_run_plan
 from mbtf_gen.planning.highlights import Highlights
 
 # Bright towards low lights.
-HIGHLIGHTS = Highlights((0.0, 0.0, -1.0, *[0.0] * 52))
 SHARE = 0.5
+HIGHLIGHTS = Highlights((0.0, 0.0, -1.0, *[0.0] * 52), SHARE)
 
 
 def write(folder: Path, layout: str = "shuffled", suffix: str = "npz", **options: Any) -> Dataset:
-    queries = {"train": "64", "test": "96", "resolution": 4, "layout": layout, "test_highlights": SHARE}
+    queries = {"train": "64", "test": "96", "resolution": 4, "layout": layout}
     if layout == "slices":
         queries |= {"train": "64/texel", "test": "16"}
     output = {"shard_queries": 64, "format": suffix}

@@ -53,7 +53,7 @@ needed, scale = needed_paths(pilot, 16, *expected, 0.05)
 for array in (*expected, needed, scale, allocation.counts(q, 16), round_up(needed, 1000)):
     c.update(array.tobytes())
 plan = QueryPlan(Lattice(6), LevelMixture(0.6, 0.4), 0.1, "shuffled", 0, n)
-q, weight = Highlights(weights[0]).draw(plan, 0.75, 2, 2000)
+q, weight = Highlights(weights[0], 0.75).draw(plan, 2, 2000)
 for array in (q.u, q.sigma, q.omega_i, q.omega_o, weight):
     c.update(array.tobytes())
 found = np.show_config(mode="dicts")["SIMD Extensions"].get("found", [])
