@@ -46,9 +46,9 @@ from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, TaskFunction
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import load_training, open_data
-from mbtf_fit.models.registry import MODELS
+from mbtf_fit.data.loader import load_training
 from mbtf_fit.training.loop import TrainingLoop, keep_freed_memory
+from mbtf_fit.training.suitable_data import open_data
 from mbtf_fit.training.trainer import Trainer, prepare_trainer
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import generate
@@ -120,7 +120,7 @@ def started(folder: str, memory: str) -> tuple[Trainer, float]:
     """A trainer at its first step, and the seconds of loading."""
     config = FitConfig.model_validate({"data": {"memory": memory}, "training": {"time": "1h"}})
     began = time.perf_counter()
-    data = open_data(folder, MODELS[config.model].layout, config.model, config.data.cache)
+    data = open_data(folder, config.model, config.data.cache)
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
     seconds = time.perf_counter() - began
     return prepare_trainer(config, data, partition, torch.device("cpu")), seconds

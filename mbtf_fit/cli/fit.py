@@ -194,12 +194,11 @@ def _announce(
     """State budget and expected time of a fit, and refuse one that the disk cannot hold."""
     from mbtf_core.files.folders import check_space
     from mbtf_core.forecast import is_long, processor_share
-    from mbtf_fit.data.loader import open_data
-    from mbtf_fit.models.registry import model_class
     from mbtf_fit.native import missing_reason
     from mbtf_fit.training.forecast import closing_seconds, fit_bytes, preparing_seconds
+    from mbtf_fit.training.suitable_data import open_data
 
-    data = [open_data(folder, model_class(config.model).layout, config.model) for folder in shards]
+    data = [open_data(folder, config.model) for folder in shards]
     size = sum(fit_bytes(config, one.lattice) for one in data)
     check_space(output, size, "reduce network.channels, or choose another folder with -o")
     training = config.training

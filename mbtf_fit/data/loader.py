@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-import shlex
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from mbtf_core.data.dataset import Dataset, Shard, ahead
-from mbtf_core.data.folder import DataFolder
-from mbtf_core.data.schema import CONFIG_NAME, Layout, Split
+from mbtf_core.data.schema import Split
 from mbtf_core.errors import InputError
 from mbtf_fit.data.layouts import TrainingImages, TrainingSlices, nearest_shapes, philox, strides
 from mbtf_fit.data.queries import QUERY_BYTES, ShardQueries, TrainingQueries, mean_value, needed
@@ -25,8 +22,6 @@ SAMPLE = 1 << 16
 # Most held-out queries of each kind. Queries of one image are correlated, so the image layout keeps fewer.
 MAX_HELD_OUT = 1 << 16
 MAX_HELD_OUT_OF_IMAGES = 1 << 14
-# Fewest queries per texel, whole images or slices of all texels, from which a fit is worthwhile.
-_FEWEST_PER_TEXEL = 20
 # Random stream of the image layout's split; the streams of its batches count up from 0.
 SPLIT_STREAM = 1 << 62
 # Labels of the rows of the train split.
@@ -52,35 +47,6 @@ class Partition:
     held_out_directions: ShardQueries
     sample: ShardQueries
     selection: Selection
-
-
-def open_data(
-    folder: str | Path | DataFolder, layout: Layout, model: str, cache: float | None = None
-) -> Dataset:
-    """Open a folder of shards to train a model that needs a layout; `cache` as in :meth:`Dataset.open`."""
-    data = Dataset.open(folder, cache)
-    if data.layout != layout:
-        raise InputError(
-            f"the data set has the {data.layout} layout, but {model} needs the {layout} layout",
-            where=data.folder,
-            hint=f"generate them: {_generated_again(data, layout, model)}"
-            if data.estimates == 2
-            else "measured data have no other layout; choose another model: --model neumip+",
-        )
-    return data
-
-
-def _generated_again(data: Dataset, layout: Layout, model: str) -> str:
-    """The commands that generate a data set again in a layout, and fit a model to it."""
-    material = (data.manifest.get("config") or {}).get("material")
-    if material is None:
-        return f"mbtf-gen ... --layout {layout}"
-    folder = f"{data.folder}-{layout}"
-    words = ["mbtf-gen", material, "--config", data.folder.at(CONFIG_NAME), "--layout", layout]
-    if data.manifest["splits"]["train"].get("queries", 0) < _FEWEST_PER_TEXEL * data.lattice.texels():
-        words += ["--queries", "100/texel"]
-    fit = shlex.join(["mbtf-fit", folder, "--model", model])
-    return f"{shlex.join([*words, '-o', folder])} && {fit}"
 
 
 def read_checked(shard: Shard) -> ShardQueries:

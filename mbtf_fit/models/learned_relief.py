@@ -68,6 +68,7 @@ class LearnedRelief(Relief):
             ],
         },
     }
+    traces_geometry = False
     takes = (*PYRAMID, *(f"network.relief.{name}" for name in ("hints", "frame", "gate")))
     learned = "heights"
 

@@ -18,7 +18,6 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 from mbtf_core.data.lattice import Lattice
-from mbtf_core.errors import InputError
 from mbtf_fit.models.model import PYRAMID, SHARED, Model, Preparation
 from mbtf_fit.models.neumip import color, encode_directions, encode_position, hidden_layers, pyramid
 from mbtf_fit.ops import Displace, Gate, Network, Operation, Rotate, Shade, Trace, Transform
@@ -44,6 +43,7 @@ class Relief(Model):
         # Oversampled texels see a quarter of the queries each: with a decay of 1, glossy materials overfit.
         "training": {"texture_weight_decay": 2.0, "blur": {"min_sigma": 1.6}},
     }
+    traces_geometry = True
     takes = (*PYRAMID, *SHARED, *(f"network.relief.{n}" for n in ("places", "hints", "frame", "gate")))
     # Texture of learned heights, in models that have one.
     learned: ClassVar[str | None] = None
@@ -88,12 +88,7 @@ class Relief(Model):
         from mbtf_fit.surface.known import KnownSurface
 
         geometry = given.data.geometry()
-        if geometry is None:
-            raise InputError(
-                f"the data set has no geometry, which {self.name} traces",
-                where=given.data.folder,
-                hint="fit a model that learns heights: --model neumip+",
-            )
+        assert geometry is not None
         self.material.know(KnownSurface.of(geometry, given.data.lattice, given.light_width))
         return given.queries
 

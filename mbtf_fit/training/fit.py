@@ -19,13 +19,12 @@ from mbtf_core.files.folders import ELSEWHERE, owned
 from mbtf_core.paths import real_path
 from mbtf_core.run.signals import stop_on_interruption
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import Partition, load_training, open_data
+from mbtf_fit.data.loader import Partition, load_training
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.formatting import format_estimate, headline
 from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material
-from mbtf_fit.models.registry import model_class
 from mbtf_fit.training.endings import describe_validations, kept_step, reached
 from mbtf_fit.training.fit_export import Member, export_fits
 from mbtf_fit.training.fit_folder import (
@@ -43,6 +42,7 @@ from mbtf_fit.training.loop import (
     read_checkpoint,
     write_checkpoint,
 )
+from mbtf_fit.training.suitable_data import open_data
 from mbtf_fit.training.trainer import Trainer, prepare_trainer
 from mbtf_fit.training.validation import (
     MarginalCost,
@@ -254,8 +254,8 @@ def _fit(
     """Fit materials to data sets; the first folder has the checkpoint."""
     begin = time.perf_counter()
     device = choose_device(config.device)
-    layout, shared = model_class(config.model).layout, config.training.shared_decoder
-    data = [open_data(folder, layout, config.model, config.data.cache) for folder in shards]
+    shared = config.training.shared_decoder
+    data = [open_data(folder, config.model, config.data.cache) for folder in shards]
     group = data if shared else ()
     members = [
         Member(out, one, identity_of(config, one, group)) for out, one in zip(folders, data, strict=True)

@@ -15,12 +15,13 @@ from mbtf_core.forecast import pilot_seconds
 from mbtf_core.stats import Estimate
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import load_training, open_data
-from mbtf_fit.models.registry import material_of, model_class
+from mbtf_fit.data.loader import load_training
+from mbtf_fit.models.registry import material_of
 from mbtf_fit.sections import TimeBudget
 from mbtf_fit.surface.known import surface_bytes
 from mbtf_fit.training.error_forecast import ErrorForecast, forecast_error
 from mbtf_fit.training.loop import TrainingLoop, choose_device, keep_freed_memory, restore, snapshot
+from mbtf_fit.training.suitable_data import open_data
 from mbtf_fit.training.trainer import TrainingProgress, prepare_trainer
 from mbtf_fit.training.validation import validation_set, validation_subset
 
@@ -103,7 +104,7 @@ def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForec
         The data set cannot be read, or suits another model.
     """
     began = time.perf_counter()
-    data = open_data(shards, model_class(config.model).layout, config.model, config.data.cache)
+    data = open_data(shards, config.model, config.data.cache)
     keep_freed_memory()
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
     pilot = {"training": config.training.model_copy(update={"time": TimeBudget(_ENDLESS), "steps": None})}

@@ -20,7 +20,7 @@ from mbtf_fit.backends.cpu.model import supports
 from mbtf_fit.backends.cpu.stepper import Adam, NativeStepper
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.layouts import SharedSlices, TrainingImages, TrainingSlices
-from mbtf_fit.data.loader import Partition, load_training, open_data
+from mbtf_fit.data.loader import Partition, load_training
 from mbtf_fit.data.queries import ShardQueries, TrainingQueries, mean_value
 from mbtf_fit.data.streaming import StreamedQueries
 from mbtf_fit.material.decoder import Decoder
@@ -36,6 +36,7 @@ from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.pytorch.textures import annealed_sigma
 from mbtf_fit.sections import TrainingSection
 from mbtf_fit.training.calibration import fit_calibration
+from mbtf_fit.training.suitable_data import open_data
 
 TrainingData = TrainingQueries | TrainingImages | TrainingSlices | SharedSlices | StreamedQueries
 # Decay rates of Adam's moments.
@@ -344,7 +345,7 @@ def prepare_trainer(
     model.initialize(torch.Generator().manual_seed(config.seed), unit)
 
     def load(folder: str) -> tuple[TrainingData, float]:
-        other = open_data(folder, model_class(config.model).layout, config.model, config.data.cache)
+        other = open_data(folder, config.model, config.data.cache)
         part = load_training(other, config.held_out, config.seed)
         typical = typical_value(mean_value(part.sample.value_a, part.sample.value_b))
         return part.training.to(device), typical

@@ -34,6 +34,9 @@ from mbtf_gen.pictures.reference import (
     render_reference,
 )
 
+# Noise relative to the mean value from which more paths are recommended.
+_NOISY = 0.2
+
 
 @dataclass(frozen=True)
 class _Scene:
@@ -75,9 +78,10 @@ class _Scene:
         noise = pooled_relative_error(image.value_a.reshape(-1, 3), image.value_b.reshape(-1, 3)).value
         exposure = chosen_exposure(self.config.exposure, [brightness(image.value)])
         write_display(file.with_suffix(""), image.value, exposure)
+        more = f"; --spp {4 * self.spp} halves it" if noise > _NOISY else ""
         shows = (
             f"the infinite plane from the same camera, path-traced with {self.spp} paths per pixel, noise "
-            f"{noise:.0%} of the mean value"
+            f"{noise:.0%} of the mean value{more}"
         )
         return {"shows": shows, "relative_noise": noise, "exposure": exposure}
 

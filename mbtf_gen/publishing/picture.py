@@ -55,9 +55,11 @@ def tile_images(arrays: Arrays, aspect: float, geometry: Geometry | None) -> dic
     """Mean value by visible position, under some lights.
 
     Images (rows, columns, 3) in 1/sr by title, row 0 at ``v → 1``, of a tile of this height over its width.
-    They are smoothed as wide as few queries require; NaN where there are none.
+    They are smoothed as wide as few queries require; NaN where there are none. Values over white and over
+    99% of the others are clipped: a highlight that few queries see would be a speck.
     """
     u, light, view, value = _queries(arrays)
+    value = np.minimum(value, max(2.0**-ALBEDO_EXPOSURE, np.quantile(value, 0.99, axis=0).max()))
     sigma = np.asarray(arrays["sigma"], np.float64).reshape(-1)
     if geometry is None:
         known = view[:, 2] > _FROM_ABOVE

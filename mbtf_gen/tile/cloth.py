@@ -83,7 +83,7 @@ def _fibers(spec: ClothFile, folder: Path) -> FiberTile:
     elif spec.knit is not None:
         aspect, yarns = _knitted(spec)
     else:
-        woven = _weave(spec)
+        woven = woven_tile(spec)
         aspect, yarns = _woven(spec, woven)
     _check_aspect(aspect, where)
     kinds = _kinds(spec)
@@ -108,8 +108,8 @@ def _fibers(spec: ClothFile, folder: Path) -> FiberTile:
 _Yarn = tuple[Curve, CrossSection, str]
 
 
-def _weave(spec: ClothFile) -> Weave:
-    """One tile of a woven cloth; checks that all named yarns are used."""
+def woven_tile(spec: ClothFile) -> Weave:
+    """One tile of a woven cloth; an InputError at a key of it that is invalid or names an unused yarn."""
     text, names = spec.weave or "", list(spec.yarns)
     draft, blocks = parse_draft(text), colors_of(text)
     if spec.warp is not None:

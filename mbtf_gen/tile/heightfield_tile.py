@@ -25,7 +25,7 @@ from mbtf_gen.tile.heights import (
     tile_mesh,
 )
 from mbtf_gen.tile.inspection import ALBEDO_RANGE, inspection_text, oddities
-from mbtf_gen.tile.maps.checks import Codes, suggestion_warning
+from mbtf_gen.tile.maps.checks import Codes, far_off, suggestion_warning
 from mbtf_gen.tile.maps.file_names import Convention
 from mbtf_gen.tile.maps.map_loader import Color, MapFacts
 from mbtf_gen.tile.maps.material_file import LOBES, ROLES
@@ -137,14 +137,16 @@ class HeightFieldTile(Tile):
             return None
         white = 1 if facts.bits is None else 2**facts.bits - 1
         what = f"heights from {facts.low * white:.5g} to {facts.high * white:.5g} need a height scale"
-        fits = self.normal_fit is not None and self.normal_fit.fits
+        fit = self.normal_fit if self.normal_fit is not None and self.normal_fit.fits else None
+        suggested = f"the normal map suggests --height-scale {fit.scale:.3g}" if fit else ""
         if facts.pixel_size is None and extent <= _NORMALIZED:
-            steep = 0.0 if fits else slope_angles(self._resampled)[0]
+            agrees = fit is not None and not far_off(self.height_scale, fit.scale)
+            steep = 0.0 if agrees else slope_angles(self._resampled)[0]
             what = f"{what}: half of the surface would be steeper than {steep:.1f}°"
-            hint = f"give one, such as --height-scale {_CUSTOMARY}, or 1 where heights are in tile widths"
-            return (what, hint) if steep > _CLIFFS else None
-        if self.normal_fit is not None and fits:
-            return what, f"the normal map suggests --height-scale {self.normal_fit.scale:.3g}"
+            hint = suggested or f"give one, such as --height-scale {_CUSTOMARY}"
+            return (what, f"{hint}; 1 where heights are in tile widths") if steep > _CLIFFS else None
+        if suggested:
+            return what, suggested
         scale = white / (facts.columns * (facts.pixel_size or 1.0))
         if facts.pixel_size is None:
             return what, (

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from mbtf_core.config.settings import build
-from mbtf_core.config.yaml_file import read_yaml
+from mbtf_core.config.yaml_file import line_of, read_yaml
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError, UsageError, check_type
 from mbtf_core.files.atomic import file_sha256
@@ -18,7 +18,7 @@ from mbtf_core.images.read import SUFFIXES, is_image
 from mbtf_core.meshes.read import MESH_FILES
 from mbtf_core.paths import named_file, suggest_path
 from mbtf_gen.tile.assembly import assemble, retiled
-from mbtf_gen.tile.cloth import cloth_tile
+from mbtf_gen.tile.cloth import cloth_tile, woven_tile
 from mbtf_gen.tile.fibers.cloth_file import CLOTH_KEYS, CURVE_FILES, ClothFile
 from mbtf_gen.tile.maps.discovery import FoundMaps, find_maps, unpack
 from mbtf_gen.tile.maps.material_file import MaterialFile
@@ -181,5 +181,12 @@ def _read(path: Path) -> Described:
     if "mesh" in document:
         return build(MeshFile, document, source=str(path))
     if CLOTH_KEYS & document.keys():
-        return build(ClothFile, document, source=str(path))
+        cloth = build(ClothFile, document, source=str(path))
+        try:
+            if cloth.weave is not None:
+                woven_tile(cloth)
+        except InputError as fault:
+            line = line_of(document, [str(fault.where)])
+            raise InputError(fault.what, where=f"{path}:{line}: {fault.where}", hint=fault.hint) from None
+        return cloth
     return build(MaterialFile, document, source=str(path))

@@ -103,8 +103,12 @@ def _front_section(runs: Sequence[Measurement], evidence: Evidence, png: Path) -
         figure = {"svg": "", "caption": "One complete run was measured; a plot and a Pareto front take two."}
         return {"figure": figure, "table": table}
 
+    # Of runs whose errors round to the same, only the fastest has a label.
+    named = {f"{m.error.value:.2g}": m for m in reversed(front)}
+
     def name(m: Measurement) -> str:
-        return f"{m.error.value:.2g} in {m.seconds.value:.0f} s" if m in front else ""
+        error = f"{m.error.value:.2g}"
+        return f"{error} in {m.seconds.value:.0f} s" if named.get(error) is m else ""
 
     axes = "seconds in total, from height map to material", "unexplained variance of test queries"
     caption = "Labels: error and total time of the runs on the Pareto front."

@@ -99,9 +99,9 @@ def _ranking(comparison: Mapping[str, Any]) -> str:
     if queries == images:
         return ""
     text = (
-        f"From the best fit on, test queries rank {', '.join(queries)}, but the mean MSE of the images ranks "
-        f"{', '.join(images)}. Test queries have footprints, lights and views of all kinds; the images weigh "
-        "the few that they show."
+        f"From best to worst, the fits are {', '.join(queries)} by the MSE of test queries, but "
+        f"{', '.join(images)} by the mean MSE of the images. Test queries have footprints, lights and views "
+        "of all kinds, the images only the few that they show."
     )
     equal = [fit for fit in comparison["fits"] if not _differs(comparison, fit)]
     return (

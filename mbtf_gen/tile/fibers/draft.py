@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
+from mbtf_core.paths import suggest_name
 
 Draft = NDArray[np.bool_]
 
@@ -119,7 +120,9 @@ def parse_draft(text: str) -> Draft:
     if words and set("".join(words)) <= {"X", "x", "."} and len({len(word) for word in words}) == 1:
         return np.array([[c in "Xx" for c in word] for word in words])
     what = f"'{text.strip()[:40]}' is not a weave"
-    raise InputError(what, where="weave", hint=_OTHERS.get((words or [""])[0], _EXAMPLES))
+    word = (words or [""])[0].lower()
+    hint = _OTHERS.get(word) or ("" if word in _WEAVES else suggest_name(word, list(_WEAVES)))
+    raise InputError(what, where="weave", hint=hint or _EXAMPLES)
 
 
 def _named(text: str) -> tuple[str | None, list[int]]:

@@ -111,3 +111,13 @@ def test_data_without_geometry_share_a_network_of_neumip(data: Path, tmp_path: P
     done = call(["mbtf-fit", *words])
     assert done.code == 0, done.err
     assert Material.load(tmp_path / "m" / "flat").config.model == "neumip"
+
+
+def test_a_model_that_traces_heights_is_refused_before_its_time_is_announced(tmp_path: Path) -> None:
+    folder = write_data(tmp_path / "data", constant(0.3), train=500, test=50)
+    edit(folder / "manifest.json", lambda manifest: manifest.update(geometry=None))
+    done = call(["mbtf-fit", str(folder), "--model", "relief", "-o", str(tmp_path / "m"), *QUICK])
+    assert done.code == 3
+    assert "has no geometry, which relief traces" in done.err
+    assert "training for" not in done.err
+    assert not (tmp_path / "m").exists()

@@ -16,8 +16,9 @@ from mbtf_core.data.schema import MANIFEST_NAME
 from mbtf_core.data.shard_files import read_shard, write_exr, write_npz
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError
-from mbtf_fit.data.loader import load_split, load_training, open_data
+from mbtf_fit.data.loader import load_split, load_training
 from mbtf_fit.sections import HeldOutSection
+from mbtf_fit.training.suitable_data import open_data
 from mbtf_gen.generation.manifest import finish
 
 TRAILING = {"u": 2, "omega_i": 3, "omega_o": 3, "value_a": 3, "value_b": 3}
@@ -72,8 +73,8 @@ def read_all(folder: Path) -> None:
         lambda: verify(folder),
         lambda: Dataset.open(folder).lattice,
         lambda: Dataset.open(folder).load("train"),
-        lambda: load_training(open_data(folder, "shuffled", "neumip"), HeldOutSection(), 0),
-        lambda: load_split(open_data(folder, "shuffled", "neumip"), "test"),
+        lambda: load_training(open_data(folder, "neumip"), HeldOutSection(), 0),
+        lambda: load_split(open_data(folder, "neumip"), "test"),
         lambda: finish(folder),
     ):
         loads_or_refuses(read)

@@ -20,9 +20,10 @@ from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig, Material, evaluate, fit
 from mbtf_fit.config import build_model
 from mbtf_fit.data.layouts import Patches, TrainingImages, nearest_shapes, strides
-from mbtf_fit.data.loader import Partition, in_region, load_training, open_data
+from mbtf_fit.data.loader import Partition, in_region, load_training
 from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.loop import TrainingLoop
+from mbtf_fit.training.suitable_data import open_data
 from mbtf_fit.training.trainer import BETAS, prepare_trainer
 from mbtf_gen.cli.app import app
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
@@ -196,7 +197,7 @@ def test_the_other_layout_is_refused_with_a_hint(tmp_path: Path) -> None:
 def test_the_hint_generates_what_the_model_needs(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "s p", queries={"train": "5/texel", "test": "40", "spp": 8}, seed=3)
     with pytest.raises(InputError) as refused:
-        open_data(data.folder, "image", "hierarchical")
+        open_data(data.folder, "hierarchical")
     generate, fit_again = refused.value.hint.removeprefix("generate them: ").split(" && ")
     line = shlex.split(generate)
     arguments = app.parse_args(line[1:], exit_on_error=False, print_error=False)[1].arguments

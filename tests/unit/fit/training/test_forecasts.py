@@ -22,13 +22,14 @@ from mbtf_core.stats import Estimate, Interval, signal_variance
 from mbtf_fit import fit
 from mbtf_fit.cli.app import app
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.loader import load_training, open_data
+from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.endings import reached
 from mbtf_fit.training.error_forecast import ErrorForecast
 from mbtf_fit.training.forecast import forecast_fit
 from mbtf_fit.training.loop import TrainingLoop
+from mbtf_fit.training.suitable_data import open_data
 from mbtf_fit.training.trainer import Trainer
 from mbtf_fit.training.validation import validation_set
 
@@ -167,7 +168,7 @@ def test_validation_uses_a_large_split(shards: Path, tmp_path: Path, monkeypatch
     """Its queries have more paths, but few of them say less than what was held out."""
 
     def looked_at(shards: Path) -> tuple[str, ShardQueries]:
-        data = open_data(shards, "shuffled", "neumip")
+        data = open_data(shards, "neumip")
         return validation_set(data, load_training(data, HeldOutSection(), 0))
 
     name, queries = looked_at(shards)

@@ -15,11 +15,12 @@ import mbtf_fit.training.trainer
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig, ModelName, build_model
-from mbtf_fit.data.loader import load_training, open_data
+from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.queries import ShardQueries, TrainingQueries
 from mbtf_fit.objective.parallel import Workers
 from mbtf_fit.sections import TrainingSection
 from mbtf_fit.training.loop import TrainingLoop, restore, snapshot, state_tensors
+from mbtf_fit.training.suitable_data import open_data
 from mbtf_fit.training.trainer import (
     Regularization,
     Trainer,
@@ -248,7 +249,7 @@ def test_a_fit_estimates_the_noise_ratio_of_its_data(tmp_path: Path) -> None:
     folder = write_data(tmp_path / "data", parallax, train=20_000, noise=0.02)
     training = {"steps": 9, "noise_regularization": 0.005, "texture_weight_decay": 1.0}
     config = FitConfig.model_validate({"model": "neumip", "training": training})
-    data = open_data(folder, "shuffled", "neumip")
+    data = open_data(folder, "neumip")
     partition = load_training(data, config.held_out, config.seed, config.data.memory)
     trainer = prepare_trainer(config, data, partition, torch.device("cpu"))
     arrays = random_queries(np.random.default_rng(5), 20_000, LATTICE)

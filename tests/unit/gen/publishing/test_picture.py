@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from support.fit_data import write_data
+from support.fit_data import constant, write_data
 from support.published import LAYOUTS, small
 
 from mbtf_core.data.dataset import Dataset
@@ -37,6 +37,16 @@ def test_images_have_v_and_the_light_where_they_belong(tmp_path: Path) -> None:
     height = np.sqrt(np.maximum(0.0, 1 - x**2 - y**2))
     expected = 1 + np.cos(np.radians(50)) * x + np.sin(np.radians(50)) * height
     assert np.corrcoef(brdf[..., 2][known], expected[known])[0, 1] > 0.95
+
+
+def test_highlights_that_few_queries_see_are_no_specks(tmp_path: Path) -> None:
+    """A query in 500 is a thousand times as bright: a mean of 32 queries would exceed white by far."""
+    write_data(tmp_path / "data", constant(0.1), train=20_000, test=10, finest=4)
+    arrays = Dataset.open(tmp_path / "data").load("train")
+    for key in ("value_a", "value_b"):
+        arrays[key] = np.where(np.arange(20_000)[:, None] % 500 == 0, 100.0, arrays[key])
+    for panel in tile_images(arrays, 1.0, None).values():
+        assert np.nanmax(panel) < 0.16
 
 
 def test_few_queries_show_ridges(tmp_path: Path) -> None:

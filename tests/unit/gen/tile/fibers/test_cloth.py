@@ -75,6 +75,7 @@ def test_every_option_changes_the_digest(tmp_path: Path) -> None:
         ("weave: plain\nyarns: {red: 1, rest: 0}\nwarp: red\n", "'rest' is in neither"),
         ("weave: plain\nyarns: {red: 1}\nwarp: rde4\n", "did you mean 'red'"),
         ("weave: houndstooth\n", "two yarns"),
+        ("seed: 1\nweave: twil 3/1\n", "yaml:2: weave: 'twil 3/1' is not a weave\n  did you mean 'twill'?"),
         ("weave: twill 3/1\nyarns: {a: 1, b: 0}\nwarp: a601 b\nweft: a499 b\n", "1204 warps"),
         ("curves: a.curves\nseed: 2\n", "seed"),
     ],

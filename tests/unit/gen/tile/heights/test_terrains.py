@@ -114,3 +114,20 @@ def test_fractions_that_are_cliffs_need_a_scale(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="steeper than 8") as caught:
         _ = load_material(tmp_path / "noise.npy").configured(DEFAULT).grid
     assert "--height-scale 0.05" in caught.value.hint
+
+
+def test_fractions_that_a_normal_map_contradicts_need_its_scale(tmp_path: Path) -> None:
+    """Bumps with a median slope of 83°, and the normals of bumps 54 times as low."""
+    phase = 2 * np.pi * 5 * (np.arange(128) + 0.5) / 128
+    heights = 0.25 * (np.sin(phase)[:, None] + np.sin(phase)) + 0.5
+    np.save(tmp_path / "height.npy", heights)
+    for times, refused in ((54.0, True), (1.0, False)):
+        slope = 0.25 * 2 * np.pi * 5 * np.cos(phase) / times
+        normal = np.stack(np.broadcast_arrays(-slope, slope[:, None], 1.0), axis=-1)
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        np.save(tmp_path / "normal.npy", (normal + 1) / 2)
+        fault = load_material(tmp_path).unit_fault()
+        assert (fault is not None) == refused
+        if fault is not None:
+            suggested = float(fault[1].split("--height-scale ")[1].split(";")[0])
+            assert suggested == pytest.approx(1 / times, rel=0.1)
