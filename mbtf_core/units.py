@@ -84,11 +84,11 @@ def format_size(size: float) -> str:
 
 
 def size_text(size: float) -> str:
-    """Readable size: ``812 kB``, ``64 MB``, ``1.7 GB``."""
+    """Readable size: ``95 B``, ``812 kB``, ``64 MB``, ``1.7 GB``."""
     for unit, factor in (("GB", 1e9), ("MB", 1e6)):
         if size >= factor:
             return f"{size / factor:.{1 if size < 10 * factor else 0}f} {unit}"
-    return f"{size / 1e3:.0f} kB"
+    return f"{size / 1e3:.0f} kB" if size >= 1e3 else f"{size:.0f} B"
 
 
 def rate_text(paths_per_second: float) -> str:

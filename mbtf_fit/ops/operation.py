@@ -143,6 +143,11 @@ class Operation(metaclass=_Checked):
         """Name and size of each value that it computes."""
         return {self.output: self.size(sizes)}
 
+    @classmethod
+    def value_fields(cls) -> list[str]:
+        """The fields that name values."""
+        return _fields_of(cls.kind(), "value")
+
     def inputs(self) -> list[str]:
         """The values that it reads, with ranges, in the order of the fields."""
         return self.named("value")
@@ -160,7 +165,7 @@ class Operation(metaclass=_Checked):
             A value for a field with one name, a list for several, None for a field that is left out.
         """
         out: list[V | list[V] | None] = []
-        for name in _fields_of(self.kind(), "value"):
+        for name in self.value_fields():
             found = getattr(self, name)
             if found is None:
                 out.append(None)

@@ -134,7 +134,8 @@ class NeuralMaterial(nn.Module):
             self._plans[key] = needed_for(self.operations, wanted, [*given])
         run, values = Execution(self, grid), dict(given)
         for op in self._plans[key]:
-            arguments: list[object] = [*op.arguments(lambda name, part: _read(values, name, part))]
+            read = op.arguments(lambda name, part: _read(values, name, part))
+            arguments: list[object] = [*map(_shaped, op.value_fields(), read)]
             if not isinstance(op, ops.Inception):
                 arguments = _aligned(arguments)
             found = PYTORCH[op](op, run, *arguments)
@@ -410,7 +411,16 @@ def _first_outputs(operations: Sequence[ops.Operation]) -> dict[str, dict[int, f
 
 def _read(values: Mapping[str, Tensor], name: str, part: slice) -> Tensor:
     """Some numbers of a value; all of them as they are."""
-    return values[name] if part == slice(None) else values[name][:, part]
+    return values[name] if part == slice(None) or values[name].ndim == 1 else values[name][:, part]
+
+
+def _shaped(field: str, argument: Tensor | list[Tensor] | None) -> object:
+    """What a field reads, with the shapes of :mod:`mbtf_fit.pytorch.operations`."""
+    if isinstance(argument, list):
+        return [_shaped(field, item) for item in argument]
+    if argument is None or (argument.ndim == 1) == (field == "level"):
+        return argument
+    return argument[:, 0] if field == "level" else argument[:, None]
 
 
 def _aligned(arguments: list[object]) -> list[object]:

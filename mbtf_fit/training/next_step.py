@@ -99,11 +99,13 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     split = errors[headline(errors)]
     own, spread = (errors.get("training", split)["unexplained"][key] for key in ("value", "error"))
     value, error = split["unexplained"]["value"], split["unexplained"]["error"]
-    untrained = cost.steps < _UNTRAINED and cost.doubling is None
-    overfit, limit = 0.5 * (cost.noise_share or 0.0), _LIMITED * cost.noise_limit
+    # A fit that kept an earlier state has trained long enough. Others, after few steps, are limited by noise
+    # only where it leaves nothing to longer training.
+    few = cost.few and cost.kept_step is None
+    learns = few and (cost.doubling is None or cost.doubling < FLAT)
+    overfit, limit = (0.0, 0.0) if learns else (0.5 * (cost.noise_share or 0.0), _LIMITED * cost.noise_limit)
     data = 1.0 - max(overfit, limit)
-    # A fit that kept an earlier state has trained long enough.
-    if cost.kept_step is None and cost.few and (value is None or value >= 1.0 or untrained):
+    if few and (value is None or value >= 1.0 or cost.steps < _UNTRAINED):
         factor = 2 ** math.ceil(math.log2(FEWEST_STEPS / cost.steps))
         return NextStep("time", f"{cost.steps} steps are few: train {factor} times as long", factor)
     short = ""
@@ -133,9 +135,9 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     if data < min(FLAT, 1.0 if time is None else time):
         return NextStep("queries", f"{short}; {_about(data)} with twice the queries")
     if time is None:
-        reason = f"{cost.steps} steps are few" if cost.few else "it is unknown what longer training gains"
+        reason = f"{cost.steps} steps are few" if few else "it is unknown what longer training gains"
         return NextStep("time", f"{reason}; try twice the training")
-    if time < FLAT or cost.few:
+    if time < FLAT or few:
         return NextStep("time", f"{_about(time)} after twice the training")
     return NextStep("none", _NO_GAIN)
 

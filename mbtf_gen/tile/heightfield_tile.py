@@ -351,14 +351,16 @@ class HeightFieldTile(Tile):
         path, extent = self.files["height"], float(np.ptp(self.height))
         if extent == 0:
             return None
+        median = slope_angles(self._resampled)[0]
         if "normal" in self.files:
-            median = slope_angles(self._resampled)[0]
             text = suggestion_warning(self.files["normal"], self.normal_fit, self.height_scale, median)
             if text is not None:
                 return text
         extent *= abs(self.height_scale)
         if self.height_from == "default" and extent > _STEEP and self.unit_fault() is None:
             return f"{path}: the displacement range is {extent:.4g} tile widths; check --height-scale"
+        if median > _CLIFFS:
+            return f"{path}: half of the surface is steeper than {median:.1f}°; check --height-scale"
         return None
 
     def warnings_in_use(self) -> tuple[str, ...]:

@@ -51,16 +51,17 @@ def test_a_model_of_a_file_is_fitted_and_read_without_the_file(fitted: Path) -> 
 
 
 def test_the_network_of_the_page_is_fitted(fitted: Path, tmp_path: Path) -> None:
-    """To a constant, at the width that the user sets."""
+    """To a constant, at the width that the user sets; the network reads the level, too."""
     file = tmp_path / "my_network.py"
-    file.write_text(code_block("how-to/add-a-model.md", "python", 1))
+    text = code_block("how-to/add-a-model.md", "python", 1)
+    file.write_text(text.replace('"half", "difference")', '"half", "difference[0:3]", "level")'))
     options = {"model": f"{file}:HalfVectorDecoder", "network": {"width": 8}, "training": {"steps": 100}}
     material = fit(FitConfig.model_validate(options), fitted / "shards", tmp_path / "out").material
     up = np.tile(np.float32([0.0, 0.0, 1.0]), (50, 1))
     value = material.evaluate(np.random.default_rng(0).random((50, 2)), np.full(50, 0.1), up, up)
     assert np.abs(value - 0.2).max() < 0.02
     weights = {name: tuple(tensor.shape) for name, tensor in material.model.state_dict().items()}
-    assert weights["decoder.0.weight"] == (8, 7 + 4 * 3)
+    assert weights["decoder.0.weight"] == (8, 7 + 4 * 3 + 1)
 
 
 @pytest.mark.parametrize(

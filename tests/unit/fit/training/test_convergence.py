@@ -101,6 +101,14 @@ def test_only_a_flat_curve_says_that_longer_training_is_useless() -> None:
         assert (next_step(found, fitted(0.2, 0.002)).kind == "none") == useless
     # Few steps ask for more, whatever the curve shows.
     assert next_step(cost(history(0.0, steps=146), {}), fitted(0.2, 0.002)).kind == "time"
+    # Cloth of 2.35 times as much noise as signal, 58 queries per texel, after 22 steps: 151 more left 0.34 of
+    # the error.
+    found = cost(history(0.5, steps=22), {}, noise_ratio=2.35, queries_per_texel=58.2)
+    few = next_step(found, fitted(0.6, 0.01, training=0.57))
+    assert few.reason == "22 steps are few: train 32 times as long"
+    # Overfitting after 146 steps that still learn; none of them, where noise leaves nothing.
+    assert next_step(MarginalCost(0.85, 0.5, 146), fitted(0.6, 0.01)).kind == "time"
+    assert next_step(MarginalCost(0.99, 0.5, 146), fitted(0.6, 0.01)).kind == "queries"
     # An error as uncertain as that of a glossy metal tells neither.
     for records in (history(0.02, error=0.4), history(0.25, error=0.4)):
         assert cost(records, {}).doubling is None
