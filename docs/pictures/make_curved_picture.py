@@ -29,7 +29,7 @@ from mbtf_gen.engine.runtime import load_mitsuba
 
 ROOT = Path(__file__).parents[2]
 OUT = ROOT / "out" / "curved"
-SIZE, SPP, EXPOSURE = 288, 64, 2.3
+SIZE, SPP, EXPOSURE = 288, 32, 2.3
 MESH = 128
 # Elevation and azimuth of view and light, by surface.
 DIRECTIONS = {

@@ -80,26 +80,32 @@ class Frame:
 
     def to_tile(self, w: Vector3f) -> Vector3f:
         """Local direction → the tile's."""
-        hand = self.x.x * self.y.y - self.x.y * self.y.x
-        w = dr.normalize(
-            mi.Vector3f(
-                hand * dr.fma(w.x, self.y.y, -w.y * self.y.x),
-                hand * dr.fma(w.y, self.x.x, -w.x * self.x.y),
-                self.side * w.z,
-            )
-        )
-        return w if self.tilt is None else tilted(w, self.tilt)
+        if self.tilt is not None:
+            w = tilted(w, self.tilt)
+        x = self._hand * dr.fma(w.x, self.y.y, -w.y * self.y.x)
+        y = self._hand * dr.fma(w.y, self.x.x, -w.x * self.x.y)
+        return dr.normalize(mi.Vector3f(x, y, self.side * w.z))
+
+    def over(self, tilt: Vector2f) -> Frame:
+        """The frame where the normal has changed by a slope over the tile's steps."""
+        x = self._hand * dr.fma(tilt.x, self.y.y, -tilt.y * self.x.y)
+        y = self._hand * dr.fma(tilt.y, self.x.x, -tilt.x * self.y.x)
+        return replace(self, tilt=mi.Vector2f(x, y))
+
+    @property
+    def _hand(self) -> Float:
+        """-1 where the frame is a mirror image."""
+        return self.x.x * self.y.y - self.x.y * self.y.x
 
     def _vector(self, w: Vector3f) -> Vector3f:
-        if self.tilt is not None:
-            w = tilted(w, self.tilt, back=True)
         return mi.Vector3f(
             dr.fma(w.x, self.x.x, w.y * self.y.x), dr.fma(w.x, self.x.y, w.y * self.y.y), self.side * w.z
         )
 
     def to_local(self, w: Vector3f) -> Vector3f:
         """Inverse of :meth:`to_tile`."""
-        return dr.normalize(self._vector(w))
+        w = dr.normalize(self._vector(w))
+        return w if self.tilt is None else tilted(w, self.tilt, back=True)
 
     def length(self, w: Vector3f) -> Float:
         """Length on the surface of the tile's unit vectors; its cube is the solid angle in the tile's frame
@@ -239,8 +245,8 @@ class MbtfBSDF(mi.BSDF):
         # The project's integrator gives them with the footprint.
         bent = si if footprints_provided.get() else with_normal_partials(si)
         form = in_axes(curvature(bent, self.uv_scale.x * self.uv_scale.y), frame.x, frame.y)
-        hit = self.shell.meet(u, level, wi, form, self.min_cos)
-        frame = replace(frame, tilt=hit.tilt)
+        hit = self.shell.meet(u, level, wi, form, self.min_cos, lambda tilt: frame.over(tilt).to_tile(si.wi))
+        frame = frame.over(hit.tilt)
         # Rays leave a mesh through its back, where shading normals of coarse ones may face them.
         front = dr.dot(si.n, si.to_world(si.wi)) > 0
         return View(self, frame, hit.u, level, hit.omega_o, front & (wi.z > 0), hit)
