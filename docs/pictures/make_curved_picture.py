@@ -90,12 +90,12 @@ def main() -> None:
     import mbtf_fit.backends.mitsuba
     from mbtf_gen.job import Job
     from mbtf_gen.pictures.displaced_mesh import DisplacedMesh
-    from mbtf_gen.pictures.shapes import Chart, Surface, render_scene, render_shape, shape_scene
+    from mbtf_gen.pictures.shapes import Chart, DisplacedSurface, render_scene, render_shape, shape_scene
 
     mbtf_fit.backends.mitsuba.register()
     job = Job.load(GeneratorConfig(material=str(ROOT / "assets/twisted_wool"), geometry={"mesh": MESH}))
     files = {"spot": Path(__file__).with_name("spot.ply"), "cloth": hanging_cloth()}
-    surfaces: dict[str, Surface] = {"sphere": Chart("sphere", int(TILES["sphere"]), 1.0)}
+    surfaces: dict[str, DisplacedSurface] = {"sphere": Chart("sphere", int(TILES["sphere"]), 1.0)}
     for name, path in files.items():
         surfaces[name] = DisplacedMesh.read(path, TILES[name], 1.0, "y" if name == "spot" else "z")
     cameras = {

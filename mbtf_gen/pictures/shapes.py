@@ -36,7 +36,7 @@ F64 = NDArray[np.float64]
 _STEEPEST = np.radians(84.0)
 
 
-class Surface(Protocol):
+class DisplacedSurface(Protocol):
     """What a material displaces; lengths are in tile widths."""
 
     @property
@@ -253,7 +253,7 @@ class ShapeImage:
 
 def render_shape(
     source: Job,
-    surface: Surface,
+    surface: DisplacedSurface,
     camera: Camera,
     omega_i: NDArray[Any],
     spp: int = 256,
