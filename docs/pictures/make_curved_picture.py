@@ -90,12 +90,12 @@ def main() -> None:
     import mbtf_fit.backends.mitsuba
     from mbtf_gen.job import Job
     from mbtf_gen.pictures.displaced_mesh import DisplacedMesh
-    from mbtf_gen.pictures.shapes import Chart, DisplacedSurface, render_scene, render_shape, shape_scene
+    from mbtf_gen.pictures.shapes import Chart, render_scene, render_shape, shape_scene
 
     mbtf_fit.backends.mitsuba.register()
     job = Job.load(GeneratorConfig(material=str(ROOT / "assets/twisted_wool"), geometry={"mesh": MESH}))
     files = {"spot": Path(__file__).with_name("spot.ply"), "cloth": hanging_cloth()}
-    surfaces: dict[str, DisplacedSurface] = {"sphere": Chart("sphere", int(TILES["sphere"]), 1.0)}
+    surfaces: dict[str, Chart | DisplacedMesh] = {"sphere": Chart("sphere", int(TILES["sphere"]), 1.0)}
     for name, path in files.items():
         surfaces[name] = DisplacedMesh.read(path, TILES[name], 1.0, "y" if name == "spot" else "z")
     cameras = {
@@ -104,7 +104,7 @@ def main() -> None:
     }
     lights = {name: from_angles(*light) for name, (_, light) in DIRECTIONS.items()}
     # First, as Mitsuba's path tracer would compile materials that are loaded.
-    references = {s: render_shape(job, surfaces[s], cameras[s], lights[s], SPP) for s in surfaces}
+    references = {s: render_shape(job, surfaces[s].mesh, cameras[s], lights[s], SPP) for s in surfaces}
     rows = []
     for name, surface in surfaces.items():
         expected = references[name]

@@ -92,25 +92,22 @@ class ReferenceSection(ViewSection):
     )
     surface: Annotated[
         Annotated[str, AfterValidator(_surface)], Flag("--surface", "sphere|cylinder|torus|FILE")
-    ] = Field("plane", description="what the material covers: a shape, or a mesh with texture coordinates")
-    tiles: Annotated[Annotated[float, Field(gt=0, le=1000)] | None, Flag("--tiles")] = Field(
+    ] = Field("plane", description="what the material covers: a shape, or a mesh with uv")
+    tiles: Annotated[Annotated[float, Field(gt=0, le=1000)] | None, Flag("--tiles-per-uv")] = Field(
         None,
-        description="tiles around a shape, or per unit of a mesh's texture coordinates; default: 13",
+        description="tiles around a shape, or per unit of a mesh's uv; default: 13",
     )
     up: Annotated[Literal["y", "z"] | None, Flag("--up")] = Field(
-        None, description="axis of a mesh that points up; default: y for glTF, else z"
+        None, description="upward axis of a mesh; default: y for glTF, else z"
     )
 
     @model_validator(mode="after")
     def _check_kind(self) -> Self:
-        shape = self.surface in get_args(Shape)
         if self.surface != "plane" and self.kind == "query":
             raise ValueError("only a plane has pictures of the kind query")
         if self.surface == "plane" and self.tiles is not None:
-            raise ValueError("a plane has no number of tiles: give tiles_across")
-        if shape and self.up is not None:
-            raise ValueError("up is of meshes alone")
-        if shape and self.tiles is not None and (self.tiles < 3 or self.tiles % 1):
+            raise ValueError("a plane has no number of tiles: choose a surface, or give tiles_across")
+        if self.surface in get_args(Shape) and self.tiles is not None and (self.tiles < 3 or self.tiles % 1):
             raise ValueError("the tiles around a shape must be a whole number of at least 3")
         return self
 

@@ -107,10 +107,11 @@ class DisplacedMesh:
         cells = self._texels(grid)
         count = int(np.abs(_areas(cells, self.faces)).sum()) + len(self.faces)
         if count > MOST_CELLS:
+            fits = int(grid.z.shape[1] * (MOST_CELLS / count) ** 0.5)
             raise InputError(
                 f"the mesh has {count:,} cells; at most {MOST_CELLS:,} can be traced",
                 where="--mesh",
-                hint=f"give --mesh {int(grid.z.shape[1] * (MOST_CELLS / count) ** 0.5)}, or fewer --tiles",
+                hint=f"give --mesh {fits}, or fewer --tiles-per-uv",
             )
         parts = np.concatenate([self._displaced(grid, cells, *p) for p in _pieces(cells, self.faces)])
         position, uv = parts[..., :3].reshape(-1, 3), parts[..., 3:].reshape(-1, 2)

@@ -46,7 +46,7 @@ from mbtf_gen.config.pictures import ReferenceConfig, ReferenceSection, Shape, V
 from mbtf_gen.forecast import announce
 from mbtf_gen.job import Job
 from mbtf_gen.pictures.displaced_mesh import DisplacedMesh
-from mbtf_gen.pictures.shapes import Chart, DisplacedSurface, render_shape
+from mbtf_gen.pictures.shapes import Chart, render_shape
 from mbtf_gen.planning.run_plan import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 
@@ -189,7 +189,7 @@ def cameras_of(view: ViewSection) -> list[Camera]:
 
 
 def picture_names(
-    view: ViewSection, kinds: Sequence[PixelKind], surface: DisplacedSurface | None = None
+    view: ViewSection, kinds: Sequence[PixelKind], surface: Chart | DisplacedMesh | None = None
 ) -> dict[tuple[Camera, PixelKind], str]:
     """Names of pictures, without suffix."""
     return {
@@ -198,7 +198,7 @@ def picture_names(
     }
 
 
-def _surface(view: ReferenceSection, aspect: float) -> DisplacedSurface | None:
+def _surface(view: ReferenceSection, aspect: float) -> Chart | DisplacedMesh | None:
     """What the tiles cover besides a plane."""
     tiles = 13.0 if view.tiles is None else view.tiles
     if view.surface == "plane":
@@ -210,7 +210,7 @@ def _surface(view: ReferenceSection, aspect: float) -> DisplacedSurface | None:
 
 
 def check_view(
-    job: Job, view: ViewSection, output: Path, kinds: int, surface: DisplacedSurface | None = None
+    job: Job, view: ViewSection, output: Path, kinds: int, surface: Chart | DisplacedMesh | None = None
 ) -> None:
     """Refuse pictures that show the horizon (UsageError) or do not fit on the disk (InputError)."""
     check_space(
@@ -250,7 +250,7 @@ def render_missing(
     console: Console,
     advance: Callable[[float], None],
     cluster: str | None = None,
-    surface: DisplacedSurface | None = None,
+    surface: Chart | DisplacedMesh | None = None,
 ) -> list[str]:
     """Render the pictures of :func:`picture_names` that a folder lacks, as EXR images, and record their
     noise and brightness; returns their names.
@@ -270,7 +270,7 @@ def render_missing(
             name,
             {
                 **{"source": job, "camera": camera, "omega_i": omega_i},
-                **({"surface": surface} if surface else {"kind": kind}),
+                **({"displaced": surface.mesh} if surface else {"kind": kind}),
                 **{"spp": view.spp, "seed": job.config.seed, "index": cameras.index(camera)},
             },
         )

@@ -14,10 +14,10 @@ rays, as wide as that of the data, and no background. Opacity and normal maps ar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,21 +34,6 @@ from mbtf_gen.tile.heights import MOST_CELLS, HeightGrid, grid_faces
 F64 = NDArray[np.float64]
 # Latitude beyond which the sphere's tiles no longer shrink.
 _STEEPEST = np.radians(84.0)
-
-
-class DisplacedSurface(Protocol):
-    """What a material displaces; lengths are in tile widths."""
-
-    @property
-    def name(self) -> str:
-        """Name of its pictures."""
-
-    @property
-    def radius(self) -> float:
-        """Largest distance from the origin."""
-
-    def mesh(self, grid: HeightGrid | None, bsdf: Any) -> Any:
-        """The displaced surface as a mesh of Mitsuba; without heights the smooth one."""
 
 
 @dataclass(frozen=True)
@@ -126,7 +111,7 @@ class Chart:
             raise InputError(
                 f"the {self.shape} has {count:,} cells; at most {MOST_CELLS:,} can be traced",
                 where="--mesh",
-                hint=f"give --mesh {int(columns * (MOST_CELLS / count) ** 0.5)}, or fewer --tiles",
+                hint=f"give --mesh {int(columns * (MOST_CELLS / count) ** 0.5)}, or fewer --tiles-per-uv",
             )
         i, j = np.arange(across + 1), np.arange(low, high + 1)
         x, y = (i + 0.5) / columns, ((j + 0.5) / rows) * self.aspect
@@ -253,7 +238,7 @@ class ShapeImage:
 
 def render_shape(
     source: Job,
-    surface: DisplacedSurface,
+    displaced: Callable[[HeightGrid, Any], Any],
     camera: Camera,
     omega_i: NDArray[Any],
     spp: int = 256,
@@ -266,7 +251,7 @@ def render_shape(
     Parameters
     ----------
     source : the material and the width of the light
-    surface : what it displaces
+    displaced : the mesh of Mitsuba of heights and a BSDF, such as :meth:`Chart.mesh`
     camera : looks at the origin
     omega_i : (3,) float array
         Unit vector towards the light.
@@ -292,7 +277,7 @@ def render_shape(
     path = {"type": "path", "max_depth": max_depth, "rr_depth": 8}
     width = source.config.light.width
     light = {"type": "mbtf_directional", "direction": omega_i.tolist(), "width": width}
-    scene = shape_scene(surface.mesh(grid, bsdf), camera, omega_i, path, light)
+    scene = shape_scene(displaced(grid, bsdf), camera, omega_i, path, light)
     # The light has unit irradiance on a plane.
     across = float(LightKernel(width).irradiance(omega_i[None])[0])
     image = render_scene(scene, spp, [seed, index])

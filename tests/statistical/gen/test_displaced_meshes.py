@@ -60,7 +60,7 @@ def test_a_mesh_of_a_shape_looks_like_the_shape(shape: Shape, around: int, job: 
         Camera(25.0, -90.0, across * r, rows=SIZE, columns=SIZE) for r in (1.0, mesh.radius / chart_radius(p))
     ]
     expected, found = (
-        render_shape(job, surface, camera, light, SPP, seed, max_depth=2)
+        render_shape(job, surface.mesh, camera, light, SPP, seed, max_depth=2)
         for seed, (surface, camera) in enumerate(zip((chart, mesh), cameras, strict=True))
     )
     mean, square = differences(halves(found), halves(expected))
@@ -84,7 +84,7 @@ def test_a_mirrored_chart_gives_the_mirrored_picture(job: Job, tmp_path: Path) -
         mesh = written(tmp_path / "sheet.obj", p * (sign, 1.0, 1.0), uv, faces[:, :: int(sign)])
         camera = Camera(50.0, 90.0 - 60.0 * sign, 5.0, rows=SIZE, columns=SIZE)
         light = from_angles(30.0, 90.0 - 130.0 * sign)
-        pictures.append(halves(render_shape(job, mesh, camera, light, SPP, seed, max_depth=2)))
+        pictures.append(halves(render_shape(job, mesh.mesh, camera, light, SPP, seed, max_depth=2)))
     mirrored = pictures[1][0][:, ::-1], pictures[1][1][:, ::-1]
     assert agree(*differences(pictures[0], mirrored))
     assert not agree(*differences(*pictures))
