@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, Self
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from mbtf_core.app.options import Flag
 from mbtf_core.color import ALBEDO_EXPOSURE
 from mbtf_core.config.settings import Settings, distinct
+from mbtf_core.meshes.read import MESH_FILES
 from mbtf_core.units import parse_numbers
 from mbtf_gen.config.generator import GeneratorConfig, Paths
 
@@ -34,6 +36,15 @@ class Direction(Settings):
 
 
 Shape = Literal["plane", "sphere", "cylinder", "torus"]
+
+
+def _surface(value: str) -> str:
+    """The name of a shape or of a mesh."""
+    if value not in get_args(Shape) and Path(value).suffix.lower() not in MESH_FILES:
+        raise ValueError(f"must be {', '.join(get_args(Shape))}, or a mesh: {', '.join(MESH_FILES)}")
+    return value
+
+
 Size = Annotated[int, Field(ge=8, le=16384)]
 TilesAcross = Annotated[
     list[Annotated[float, Field(gt=0, le=1e4)]],
@@ -79,24 +90,32 @@ class ReferenceSection(ViewSection):
     kind: Annotated[Literal["query", "pixel", "both"], Flag("--kind")] = Field(
         "both", description="values: M at each pixel's footprint (query), or the filtered image (pixel)"
     )
-    surface: Annotated[Shape, Flag("--surface")] = Field(
-        "plane", description="what the material covers; a shape is shown whole by default, path-traced"
+    surface: Annotated[
+        Annotated[str, AfterValidator(_surface)], Flag("--surface", "sphere|cylinder|torus|FILE")
+    ] = Field("plane", description="what the material covers: a shape, or a mesh with uv")
+    tiles: Annotated[Annotated[float, Field(gt=0, le=1000)] | None, Flag("--tiles-per-uv")] = Field(
+        None,
+        description="tiles around a shape, or per unit of a mesh's uv; default: 13",
     )
-    tiles: Annotated[Annotated[int, Field(ge=3, le=1000)], Flag("--tiles-around")] = Field(
-        13, description="tiles around the equator"
+    up: Annotated[Literal["y", "z"] | None, Flag("--up")] = Field(
+        None, description="upward axis of a mesh; default: y for glTF, else z"
     )
 
     @model_validator(mode="after")
     def _check_kind(self) -> Self:
         if self.surface != "plane" and self.kind == "query":
-            raise ValueError(f"a {self.surface} has no pictures of the kind query")
+            raise ValueError("only a plane has pictures of the kind query")
+        if self.surface == "plane" and self.tiles is not None:
+            raise ValueError("a plane has no number of tiles: choose a surface, or give tiles_across")
+        if self.surface in get_args(Shape) and self.tiles is not None and (self.tiles < 3 or self.tiles % 1):
+            raise ValueError("the tiles around a shape must be a whole number of at least 3")
         return self
 
-    def framed(self) -> Self:
-        """With a field of view around a shape where none is given."""
-        if self.surface == "plane" or "tiles_across" in self.model_fields_set:
+    def framed(self, radius: float) -> Self:
+        """With a field of view around a surface of a radius in tile widths where none is given."""
+        if "tiles_across" in self.model_fields_set:
             return self
-        return self.model_copy(update={"tiles_across": [float(math.ceil(1.2 * self.tiles / math.pi))]})
+        return self.model_copy(update={"tiles_across": [float(math.ceil(2.4 * radius))]})
 
 
 class PreviewSection(Settings):

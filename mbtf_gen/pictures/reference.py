@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,7 @@ from mbtf_core.data.schema import Queries
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import PartialError, UsageError, check_type
+from mbtf_core.files.atomic import file_sha256
 from mbtf_core.files.folders import OutputFolder, check_space, owned
 from mbtf_core.pictures import (
     PIXEL_SIGMA,
@@ -44,7 +45,8 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.pictures import ReferenceConfig, ReferenceSection, Shape, ViewSection
 from mbtf_gen.forecast import announce
 from mbtf_gen.job import Job
-from mbtf_gen.pictures.shapes import render_shape
+from mbtf_gen.pictures.displaced_mesh import DisplacedMesh
+from mbtf_gen.pictures.shapes import Chart, render_shape
 from mbtf_gen.planning.run_plan import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 
@@ -186,20 +188,30 @@ def cameras_of(view: ViewSection) -> list[Camera]:
     ]
 
 
-def picture_names(view: ViewSection, kinds: Sequence[PixelKind]) -> dict[tuple[Camera, PixelKind], str]:
+def picture_names(
+    view: ViewSection, kinds: Sequence[PixelKind], surface: Chart | DisplacedMesh | None = None
+) -> dict[tuple[Camera, PixelKind], str]:
     """Names of pictures, without suffix."""
-    pairs, shape = product(cameras_of(view), kinds), _shape_of(view)
     return {
-        (camera, kind): f"{kind if shape == 'plane' else shape}-tiles{camera.tiles_across:g}"
-        for camera, kind in pairs
+        (camera, kind): f"{surface.name if surface else kind}-tiles{camera.tiles_across:g}"
+        for camera, kind in product(cameras_of(view), kinds)
     }
 
 
-def _shape_of(view: ViewSection) -> Shape:
-    return view.surface if isinstance(view, ReferenceSection) else "plane"
+def _surface(view: ReferenceSection, aspect: float) -> Chart | DisplacedMesh | None:
+    """What the tiles cover besides a plane."""
+    tiles = 13.0 if view.tiles is None else view.tiles
+    if view.surface == "plane":
+        return None
+    for shape in get_args(Shape):
+        if shape == view.surface:
+            return Chart(shape, int(tiles), aspect)
+    return DisplacedMesh.read(Path(view.surface), tiles, aspect, view.up)
 
 
-def check_view(job: Job, view: ViewSection, output: Path, kinds: int) -> None:
+def check_view(
+    job: Job, view: ViewSection, output: Path, kinds: int, surface: Chart | DisplacedMesh | None = None
+) -> None:
     """Refuse pictures that show the horizon (UsageError) or do not fit on the disk (InputError)."""
     check_space(
         output,
@@ -207,11 +219,11 @@ def check_view(job: Job, view: ViewSection, output: Path, kinds: int) -> None:
         "reduce --size, or choose another folder with -o",
     )
     camera = min(cameras_of(view), key=lambda c: c.tiles_across)
-    if not isinstance(view, ReferenceSection) or view.surface == "plane":
+    if surface is None:
         camera.queries(from_angles(90, 0))
-    elif camera.distance <= (radius := view.tiles / (2.0 * np.pi)):
-        least = math.ceil(10.0 * radius * camera.tiles_across / camera.distance) / 10.0
-        what = f"{camera.tiles_across:g} places the camera inside the {view.surface}"
+    elif camera.distance <= surface.radius:
+        least = math.ceil(10.0 * surface.radius * camera.tiles_across / camera.distance) / 10.0
+        what = f"{camera.tiles_across:g} places the camera inside the {surface.name}"
         raise UsageError(what, where="--tiles-across", hint=f"give more than {least:g}")
 
 
@@ -238,6 +250,7 @@ def render_missing(
     console: Console,
     advance: Callable[[float], None],
     cluster: str | None = None,
+    surface: Chart | DisplacedMesh | None = None,
 ) -> list[str]:
     """Render the pictures of :func:`picture_names` that a folder lacks, as EXR images, and record their
     noise and brightness; returns their names.
@@ -247,31 +260,30 @@ def render_missing(
     InputError : a finished picture has changed
     PartialError : a picture failed; the same command renders the missing ones
     """
-    names = picture_names(view, kinds)
+    names = picture_names(view, kinds, surface)
     omega_i = from_angles(view.light.elevation, view.light.azimuth)
     cameras = cameras_of(view)
     missing = {key: name for key, name in names.items() if folder.finished(name) is None}
     advance(len(names) - len(missing))
-    curved = view if isinstance(view, ReferenceSection) and view.surface != "plane" else None
     items = [
         Item(
             name,
             {
                 **{"source": job, "camera": camera, "omega_i": omega_i},
-                **({"shape": curved.surface, "around": curved.tiles} if curved else {"kind": kind}),
+                **({"displaced": surface.mesh} if surface else {"kind": kind}),
                 **{"spp": view.spp, "seed": job.config.seed, "index": cameras.index(camera)},
             },
         )
         for (camera, kind), name in missing.items()
     ]
     with open_runner(cluster if missing else None, console.note) as runner:
-        if runner.here and missing and curved is None:
+        if runner.here and missing and surface is None:
             paths, estimator = len(missing) * view.size**2 * view.spp, picture_estimator(job)
             seconds = partial(picture_seconds, estimator, cameras[0], omega_i, paths)
             size, fibers = len(missing) * _picture_bytes(job, view), job.material.scatters
             faster = f"--size {max(1, view.size // 2)}, --spp {max(2, view.spp // 4 * 2)}"
             announce(console, paths, seconds, size, fibers, faster)
-        for done in runner.map(render_shape if curved else render_reference, items):
+        for done in runner.map(render_shape if surface else render_reference, items):
             if done.error:
                 hint = "the same command renders the missing pictures"
                 raise PartialError(f"picture {done.name} failed: {done.error}", hint=hint)
@@ -306,18 +318,24 @@ def render_references(
 
     Raises
     ------
-    UsageError : the view shows the horizon, or the camera is inside the shape
-    InputError : the folder holds something else, or the pictures do not fit on the disk
+    UsageError : the view shows the horizon, or the camera is inside the surface
+    InputError : the folder holds something else, the surface cannot be displaced, or the pictures do not fit
+        on the disk
     PartialError : a picture failed; the same command renders the missing ones
     """
-    config = config.model_copy(update={"reference": config.reference.framed()})
     wanted, job = config.reference, Job.load(config)
+    inputs, surface = dict(job.material.digests), _surface(wanted, job.material.aspect)
+    if surface is not None:
+        wanted = wanted.framed(surface.radius)
+        job = replace(job, config=job.config.model_copy(update={"reference": wanted}))
+    if isinstance(surface, DisplacedMesh):
+        inputs["surface"] = file_sha256(Path(wanted.surface))
     job.announce_briefly()
     kinds: tuple[PixelKind, ...] = ("query", "pixel") if wanted.kind == "both" else (wanted.kind,)
-    if wanted.surface != "plane":
+    if surface is not None:
         kinds = ("pixel",)
-    names = picture_names(wanted, kinds)
-    check_view(job, wanted, output, len(kinds))
+    names = picture_names(wanted, kinds, surface)
+    check_view(job, wanted, output, len(kinds), surface)
     note_fine_pixels(cameras_of(wanted), job.lattice, console)
     keep_on_interruption(f"the finished pictures are kept in {output}")
     with (
@@ -329,10 +347,10 @@ def render_references(
             "mbtf-gen reference",
             files=[f"{name}.{suffix}" for name in names.values() for suffix in ("exr", "png")],
             config=job.config.model_dump(mode="json", exclude={"queries", "output"}),
-            inputs=job.material.digests,
+            inputs=inputs,
             overwrite=overwrite,
         )
-        rendered = render_missing(folder, job, wanted, kinds, console, bar.advance, cluster)
+        rendered = render_missing(folder, job, wanted, kinds, console, bar.advance, cluster, surface)
         known = {name: folder.finished(name) or {} for name in names.values()}
         exposure = chosen_exposure(config.exposure, [facts["brightness"] for facts in known.values()])
         for name in known:

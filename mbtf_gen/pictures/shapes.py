@@ -9,13 +9,13 @@ point (x, y) of the tiles lies at ``p + s z n``, z ≤ 0. N tiles around, with `
 - torus: outer radius R; a tube of M ≈ N/2 tiles around, whose ratio of radii is r/R₀ = k/√(1+k²), k = M a/N.
 
 The axis of a shape is z. A picture shows radiance in 1/sr under a distant light of irradiance 1 across its
-rays, and no background. Opacity and normal maps are left out.
+rays, as wide as that of the data, and no background. Opacity and normal maps are left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from mbtf_core.images.exr import write_channels
 from mbtf_core.pictures import PIXEL_SIGMA, Camera
 from mbtf_gen.config.pictures import Shape
 from mbtf_gen.job import Job
+from mbtf_gen.sampling.light_kernel import LightKernel
 from mbtf_gen.tile.heights import MOST_CELLS, HeightGrid, grid_faces
 
 F64 = NDArray[np.float64]
@@ -49,6 +50,11 @@ class Chart:
     shape: Shape
     around: int
     aspect: float
+
+    @property
+    def name(self) -> str:
+        """The shape's name."""
+        return self.shape
 
     @property
     def radius(self) -> float:
@@ -105,7 +111,7 @@ class Chart:
             raise InputError(
                 f"the {self.shape} has {count:,} cells; at most {MOST_CELLS:,} can be traced",
                 where="--mesh",
-                hint=f"give --mesh {int(columns * (MOST_CELLS / count) ** 0.5)}, or fewer --tiles-around",
+                hint=f"give --mesh {int(columns * (MOST_CELLS / count) ** 0.5)}, or fewer --tiles-per-uv",
             )
         i, j = np.arange(across + 1), np.arange(low, high + 1)
         x, y = (i + 0.5) / columns, ((j + 0.5) / rows) * self.aspect
@@ -116,12 +122,9 @@ class Chart:
         uv = np.stack(np.broadcast_arrays(x[None], 1.0 - y[:, None] / self.aspect), -1)
         # Rows of :func:`grid_faces` run downwards.
         order = slice(None, None, -1)
-        import mitsuba as mi
-
         faces, normals = grid_faces(*p.shape[:2]), None if grid is not None else n[order].reshape(-1, 3)
-        material = mi.load_dict(bsdf) if isinstance(bsdf, dict) else bsdf
         position, texture = p[order].reshape(-1, 3), uv[order].reshape(-1, 2)
-        return mitsuba_mesh("shape", material, position, texture, faces, normals, flat=normals is None)
+        return mitsuba_mesh("shape", bsdf, position, texture, faces, normals, flat=normals is None)
 
 
 def _around(azimuth: F64, radius: F64, z: F64) -> F64:
@@ -132,11 +135,11 @@ def mitsuba_mesh(
     name: str, bsdf: Any, position: F64, uv: F64, faces: Any, normals: F64 | None = None, flat: bool = False
 ) -> Any:
     """A mesh of Mitsuba, of vertices (n, 3), uv (n, 2) and triangles (m, 3), with vertex normals (n, 3) or
-    `flat` ones of faces."""
+    `flat` ones of faces; its BSDF may be a dictionary."""
     import mitsuba as mi
 
     props = mi.Properties()
-    props["bsdf"] = bsdf
+    props["bsdf"] = mi.load_dict(bsdf) if isinstance(bsdf, dict) else bsdf
     props["face_normals"] = flat
     mesh = mi.Mesh(
         name,
@@ -156,8 +159,15 @@ def mitsuba_mesh(
     return mesh
 
 
-def shape_scene(mesh: Any, camera: Camera, omega_i: NDArray[Any], integrator: dict[str, Any]) -> Any:
-    """A scene of Mitsuba: a shape around the origin that the camera looks at, a light, no background."""
+def shape_scene(
+    mesh: Any,
+    camera: Camera,
+    omega_i: NDArray[Any],
+    integrator: dict[str, Any],
+    light: dict[str, Any] | None = None,
+) -> Any:
+    """A scene of Mitsuba: a shape around the origin that the camera looks at, no background, and a light; by
+    default a distant one of irradiance 1."""
     import mitsuba as mi
 
     forward, _, up = camera.frame()
@@ -183,7 +193,7 @@ def shape_scene(mesh: Any, camera: Camera, omega_i: NDArray[Any], integrator: di
                     "sample_border": True,
                 },
             },
-            "light": {"type": "directional", "direction": [-float(c) for c in omega_i], "irradiance": 1.0},
+            "light": light or {"type": "directional", "direction": (-omega_i).tolist(), "irradiance": 1.0},
             "shape": mesh,
         }
     )
@@ -228,8 +238,7 @@ class ShapeImage:
 
 def render_shape(
     source: Job,
-    shape: Shape,
-    around: int,
+    displaced: Callable[[HeightGrid, Any], Any],
     camera: Camera,
     omega_i: NDArray[Any],
     spp: int = 256,
@@ -237,13 +246,13 @@ def render_shape(
     index: int = 0,
     max_depth: int = -1,
 ) -> ShapeImage:
-    """Path-trace a displaced shape with Mitsuba's own path tracer.
+    """Path-trace a displaced surface with Mitsuba's own path tracer.
 
     Parameters
     ----------
-    source : the material
-    shape, around : the shape, and the tiles around its axis
-    camera : looks at the shape's center
+    source : the material and the width of the light
+    displaced : the mesh of Mitsuba of heights and a BSDF, such as :meth:`Chart.mesh`
+    camera : looks at the origin
     omega_i : (3,) float array
         Unit vector towards the light.
     spp : paths per pixel, both halves together; even
@@ -262,12 +271,17 @@ def render_shape(
 
     register_plugins()
     material = source.material.with_maps(opacity=None)
-    grid, surface = material.grid, material.surface()
-    if grid is None or not isinstance(surface, dict):
+    grid, bsdf = material.grid, material.surface()
+    if grid is None or not isinstance(bsdf, dict):
         raise UsageError("displaces height maps only", where="--surface")
-    mesh = Chart(shape, around, material.aspect).mesh(grid, surface)
     path = {"type": "path", "max_depth": max_depth, "rr_depth": 8}
-    return render_scene(shape_scene(mesh, camera, omega_i, path), spp, [seed, index])
+    width = source.config.light.width
+    light = {"type": "mbtf_directional", "direction": omega_i.tolist(), "width": width}
+    scene = shape_scene(displaced(grid, bsdf), camera, omega_i, path, light)
+    # The light has unit irradiance on a plane.
+    across = float(LightKernel(width).irradiance(omega_i[None])[0])
+    image = render_scene(scene, spp, [seed, index])
+    return replace(image, value_a=across * image.value_a, value_b=across * image.value_b)
 
 
 def render_scene(scene: Any, spp: int, seed: Sequence[int]) -> ShapeImage:

@@ -56,6 +56,15 @@ class HeightGrid:
         """Largest height difference in tile widths."""
         return float(self.z.max() - self.z.min())
 
+    def at(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Heights (...) of the triangles at places (..., 2), in cells along x and y from the first vertex of
+        the lowest row."""
+        z, cell = self.z[::-1], np.floor(places).astype(np.int64)
+        x, y = np.moveaxis(places - cell, -1, 0)
+        rows, columns = ((cell[..., k, None] + (0, 1)) % z.shape[1 - k] for k in (1, 0))
+        a, b, c, d = (z[rows[..., j], columns[..., i]] for j in (0, 1) for i in (0, 1))
+        return a + (b - a) * x + (c - a) * y + (d - b - c + a) * np.maximum(0.0, x + y - 1.0)
+
     def trace(self, unit: float, below: bool = False) -> TileGeometry:
         """The surface as rays meet it, see :meth:`mbtf_gen.tile.protocol.Tile.trace`.
 

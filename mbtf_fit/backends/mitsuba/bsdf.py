@@ -18,7 +18,7 @@ import numpy as np
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.pictures import pixel_sigma
 from mbtf_fit.backends.mitsuba.backend import Arithmetic
-from mbtf_fit.backends.mitsuba.curvature import curvature, rotated, with_normal_partials
+from mbtf_fit.backends.mitsuba.curvature import curvature, in_axes, with_normal_partials
 from mbtf_fit.backends.mitsuba.evaluator import Evaluator
 from mbtf_fit.backends.mitsuba.lobes import LobeTextures, Mixture, fit_lobes
 from mbtf_fit.backends.mitsuba.names import BSDF_NAME, footprints_provided, refuse_unknown
@@ -56,41 +56,61 @@ _warned: set[Path] = set()
 
 @dataclass(frozen=True)
 class Frame:
-    """The tile's frame at hits: the shading frame, rotated about the normal by an angle of cosine c and sine
-    s, and reflected where hand is -1; upside down where side is -1; then tilted, over a curved surface."""
+    """The tile's frame at hits: x and y are steps of the tile in the shading frame, in units in which they
+    span an area of 1, as stretched and sheared as texture coordinates are. Directions of the tile are those
+    in which rays cross its heights. It is upside down where side is -1; then tilted, over a curved surface.
+    """
 
-    c: Float
-    s: Float
-    hand: Float
+    x: Vector2f
+    y: Vector2f
     side: Float
     tilt: Vector2f | None = None
 
     @classmethod
-    def at(cls, si: SurfaceInteraction3f, two_sided: bool = False) -> Frame:
-        """x along ∂p/∂u, y towards decreasing v of Mitsuba (images have row 0 there at v = 0), z towards the
-        viewer where the surface is two-sided."""
-        du, dv = si.sh_frame.to_local(si.dp_du), si.sh_frame.to_local(si.dp_dv)
-        length = dr.sqrt(dr.fma(du.x, du.x, du.y * du.y))
-        good = length > 0
-        hand = dr.select(du.x * dv.y - du.y * dv.x > 0, mi.Float(-1.0), 1.0)
+    def at(cls, si: SurfaceInteraction3f, two_sided: bool = False, scale: Any = (1.0, 1.0)) -> Frame:
+        """x along ∂p/∂u, y along -∂p/∂v of Mitsuba (images have row 0 there at v = 0), of tiles that have a
+        scale per unit of u and v, z towards the viewer where the surface is two-sided."""
+        du, dv = si.sh_frame.to_local(si.dp_du) / scale[0], si.sh_frame.to_local(si.dp_dv) / -scale[1]
+        area = dr.abs(du.x * dv.y - du.y * dv.x)
+        good, unit = area > 0.0, dr.rsqrt(area)
+        x = dr.select(good, mi.Vector2f(du.x, du.y) * unit, mi.Vector2f(1.0, 0.0))
+        y = dr.select(good, mi.Vector2f(dv.x, dv.y) * unit, mi.Vector2f(0.0, 1.0))
         side = dr.select(si.wi.z < 0, mi.Float(-1.0), 1.0) if two_sided else mi.Float(1.0)
-        return cls(dr.select(good, du.x / length, 1.0), dr.select(good, du.y / length, 0.0), hand, side)
+        return cls(x, y, side)
 
     def to_tile(self, w: Vector3f) -> Vector3f:
         """Local direction → the tile's."""
-        w = mi.Vector3f(
-            dr.fma(self.c, w.x, self.s * w.y),
-            self.hand * dr.fma(self.c, w.y, -self.s * w.x),
-            self.side * w.z,
+        if self.tilt is not None:
+            w = tilted(w, self.tilt)
+        x = self._hand * dr.fma(w.x, self.y.y, -w.y * self.y.x)
+        y = self._hand * dr.fma(w.y, self.x.x, -w.x * self.x.y)
+        return dr.normalize(mi.Vector3f(x, y, self.side * w.z))
+
+    def over(self, tilt: Vector2f) -> Frame:
+        """The frame where the normal has changed by a slope over the tile's steps."""
+        x = self._hand * dr.fma(tilt.x, self.y.y, -tilt.y * self.x.y)
+        y = self._hand * dr.fma(tilt.y, self.x.x, -tilt.x * self.y.x)
+        return replace(self, tilt=mi.Vector2f(x, y))
+
+    @property
+    def _hand(self) -> Float:
+        """-1 where the frame is a mirror image."""
+        return self.x.x * self.y.y - self.x.y * self.y.x
+
+    def _vector(self, w: Vector3f) -> Vector3f:
+        return mi.Vector3f(
+            dr.fma(w.x, self.x.x, w.y * self.y.x), dr.fma(w.x, self.x.y, w.y * self.y.y), self.side * w.z
         )
-        return w if self.tilt is None else tilted(w, self.tilt)
 
     def to_local(self, w: Vector3f) -> Vector3f:
         """Inverse of :meth:`to_tile`."""
-        if self.tilt is not None:
-            w = tilted(w, self.tilt, back=True)
-        y = self.hand * w.y
-        return mi.Vector3f(dr.fma(self.c, w.x, -self.s * y), dr.fma(self.s, w.x, self.c * y), self.side * w.z)
+        w = dr.normalize(self._vector(w))
+        return w if self.tilt is None else tilted(w, self.tilt, back=True)
+
+    def length(self, w: Vector3f) -> Float:
+        """Length on the surface of the tile's unit vectors; its cube is the solid angle in the tile's frame
+        over that on the surface."""
+        return dr.norm(self._vector(w))
 
 
 class MbtfBSDF(mi.BSDF):
@@ -217,16 +237,16 @@ class MbtfBSDF(mi.BSDF):
 
     def _view(self, si: SurfaceInteraction3f) -> View:
         self._warn_once()
-        frame, u = Frame.at(si, self.two_sided), self.uv(si)
+        frame, u = Frame.at(si, self.two_sided, self.uv_scale), self.uv(si)
         level = self.evaluator.level(self.footprint(si))
         wi = frame.to_tile(si.wi)
         if self.shell is None:
             return View(self, frame, u, level, wi, wi.z > 0)
         # The project's integrator gives them with the footprint.
         bent = si if footprints_provided.get() else with_normal_partials(si)
-        form = rotated(curvature(bent, self.uv_scale.x * self.uv_scale.y), frame.c, frame.s, frame.hand)
-        hit = self.shell.meet(u, level, wi, form, self.min_cos)
-        frame = replace(frame, tilt=hit.tilt)
+        form = in_axes(curvature(bent, self.uv_scale.x * self.uv_scale.y), frame.x, frame.y)
+        hit = self.shell.meet(u, level, wi, form, self.min_cos, lambda tilt: frame.over(tilt).to_tile(si.wi))
+        frame = frame.over(hit.tilt)
         # Rays leave a mesh through its back, where shading normals of coarse ones may face them.
         front = dr.dot(si.n, si.to_world(si.wi)) > 0
         return View(self, frame, hit.u, level, hit.omega_o, front & (wi.z > 0), hit)
@@ -249,7 +269,7 @@ class MbtfBSDF(mi.BSDF):
         wo = mixture.sample(reused, sample2)
         good = active & ~transmitted & view.reflects(ctx) & view.front & (wo.z > 0)
         wo = dr.select(good, wo, mi.Vector3f(0, 0, 1))
-        value, pdf = view.value(ctx, wo), mixture.density(wo) * (1.0 - through)
+        value, pdf = view.value(ctx, wo), view.density(mixture, wo) * (1.0 - through)
         good &= pdf > 0
         bs = dr.zeros(mi.BSDFSample3f, dr.width(wo))
         bs.wo = dr.select(transmitted, -si.wi, view.frame.to_local(wo))
@@ -267,7 +287,7 @@ class MbtfBSDF(mi.BSDF):
         view = self._view(si)
         to_light = view.frame.to_tile(wo)
         good = active & view.reflects(ctx) & view.front & view.above(to_light)
-        pdf = view.mixture().density(to_light) * (1.0 - view.transmission_probability(ctx))
+        pdf = view.density(view.mixture(), to_light) * (1.0 - view.transmission_probability(ctx))
         return dr.select(good, view.value(ctx, to_light), 0.0), dr.select(good, pdf, 0.0)
 
     # Dr.Jit drops what the caller does not use.
@@ -341,22 +361,29 @@ class View:
         lobes = self.bsdf.lobes
         return Mixture.cosine(self.wi) if lobes is None else lobes.at(self.u, self.level, self.wi)
 
+    def density(self, mixture: Mixture, wo: Vector3f) -> Float:
+        """Density of a direction per solid angle on the surface."""
+        length = self.frame.length(wo)
+        return mixture.density(wo) * length * dr.square(length)
+
     def value(self, ctx: BSDFContext, wo: Vector3f) -> Color3f:
         """f·cos; light travels towards wi, or away from it where paths start at lights."""
         viewer, light = (clamped(w, self.bsdf.min_cos) for w in (self.wi, wo))
+        # Of the surface over that in the tile's frame.
+        cosine = dr.rcp(self.frame.length(wo))
         if ctx.mode == mi.TransportMode.Importance:
             viewer, light = light, viewer
         evaluator, hit = self.bsdf.evaluator, self.hit
         if hit is None or ctx.mode == mi.TransportMode.Importance:
             values = evaluator.stage1(self.u, self.level, viewer)
-            value = evaluator.value(values, light) * dr.maximum(wo.z, 0.0)
+            value = evaluator.value(values, light) * cosine * dr.maximum(wo.z, 0.0)
             return value if hit is None else value * hit.share
         values = evaluator.stage1(self.u, self.level, viewer, hit.values)
         least = self.bsdf.min_cos
         visible = hit.visibility(wo)
         lit = DirectLight(visible, wo, dr.maximum(wo.z, least), least, hit.flat)
-        cosine = hit.light_cosine(wo, least, visible)
-        cosine = dr.select(hit.flat, dr.maximum(wo.z, 0.0), cosine)
+        curved = hit.light_cosine(wo, least, visible)
+        cosine *= dr.select(hit.flat, dr.maximum(wo.z, 0.0), curved)
         return evaluator.value(values, light, lit) * cosine * hit.share
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from mbtf_gen.engine.types import Float, SurfaceInteraction3f, Vector3f
+from mbtf_gen.engine.types import Float, SurfaceInteraction3f, Vector2f, Vector3f
 
 
 def with_normal_partials(si: SurfaceInteraction3f, active: Any = True) -> SurfaceInteraction3f:
@@ -61,13 +61,8 @@ def curvature(si: SurfaceInteraction3f, area: Float) -> tuple[Float, Float, Floa
     return xx, xy, yy
 
 
-def rotated(form: tuple[Float, Float, Float], c: Float, s: Float, hand: Float) -> Vector3f:
-    """The form in a frame that is rotated by an angle of cosine c and sine s, and reflected where `hand` is
-    -1."""
+def in_axes(form: tuple[Float, Float, Float], x: Vector2f, y: Vector2f) -> Vector3f:
+    """The form (xx, xy, yy) over steps along vectors of its plane."""
     xx, xy, yy = form
-    cc, cs, ss = c * c, c * s, s * s
-    return mi.Vector3f(
-        cc * xx + 2.0 * cs * xy + ss * yy,
-        hand * ((cc - ss) * xy - cs * (xx - yy)),
-        ss * xx - 2.0 * cs * xy + cc * yy,
-    )
+    ax, ay = (mi.Vector2f(xx * e.x + xy * e.y, xy * e.x + yy * e.y) for e in (x, y))
+    return mi.Vector3f(dr.dot(ax, x), dr.dot(ax, y), dr.dot(ay, y))

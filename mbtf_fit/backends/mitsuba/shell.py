@@ -6,7 +6,7 @@ those of the displacement.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -121,9 +121,16 @@ class Shell:
         return closest_height(self.heightfield, ray, self.op.crossings, active)
 
     def meet(
-        self, u: Point2f, level: Float, omega_o: Vector3f, curvature: Vector3f, min_cos: Float
+        self,
+        u: Point2f,
+        level: Float,
+        omega_o: Vector3f,
+        curvature: Vector3f,
+        min_cos: Float,
+        over: Callable[[Vector2f], Vector3f],
     ) -> ShellHit:
-        """Trace view rays over a surface of curvatures (xx, xy, yy), in 1/tile width."""
+        """Trace view rays over a surface of curvatures (xx, xy, yy), in 1/tile width; `over` is the direction
+        towards the viewer in the frame at a tilt."""
         largest = dr.maximum(dr.abs(curvature.x), dr.abs(curvature.z)) + dr.abs(curvature.y)
         curvature = curvature * dr.minimum(1.0, DEEPEST / dr.maximum(largest * self.depth, 1e-9))
         flat = (curvature.x == 0) & (curvature.y == 0) & (curvature.z == 0)
@@ -160,7 +167,7 @@ class Shell:
         bend = dr.select(flat, 0.0, s) * tilt(curvature, arc.azimuth)
         # From behind, the ray meets no heights.
         still = flat | (omega_o.z <= 0.0)
-        there = dr.select(still, omega_o, clamped(tilted(omega_o, bend), min_cos))
+        there = dr.select(still, omega_o, clamped(over(bend), min_cos))
         before = displaced([x, y], -z, there, self.aspect)
         return ShellHit(
             self,

@@ -76,7 +76,7 @@ def test_a_curved_shape_looks_like_displaced_geometry(shape: str, bumps: tuple[J
     """Of a radius of 1.1 tiles, four times the depth of the bumps."""
     around = 7
     camera = Camera(25.0, -90.0, 1.15 * around / np.pi, rows=SIZE, columns=SIZE)
-    expected = render_shape(bumps[0], shape, around, camera, LIGHT, SPP, max_depth=2)
+    expected = render_shape(bumps[0], Chart(shape, around, 1.0).mesh, camera, LIGHT, SPP, max_depth=2)
     found = picture(shape, around, bumps, camera, silhouettes=True)
     smooth = picture(shape, around, bumps, camera)
     assert outline_distance(found, expected) < 0.5

@@ -81,7 +81,8 @@ ROTATION = np.array([[np.cos(0.5), -np.sin(0.5)], [np.sin(0.5), np.cos(0.5)]])
 def test_the_tile_follows_its_uv(
     material: tuple[Path, Material], mirrored: bool, scale: tuple[float, float]
 ) -> None:
-    """Turned, mirrored and scaled coordinates: the plane equals the material at turned, mirrored queries."""
+    """Turned, mirrored and scaled coordinates: the plane equals the material at such queries, whose
+    directions are stretched as the tile is."""
     folder, fitted = material
     turn = ROTATION @ np.diag([1.0, -1.0 if mirrored else 1.0])
     to_uv = np.concatenate([np.diag([1.0, -1.0]) @ turn, [[0.0], [1.0]]], 1)
@@ -89,9 +90,11 @@ def test_the_tile_follows_its_uv(
     # Mitsuba's v is 1 - y here, and is scaled about 0.
     x, y = np.moveaxis(seen_places(CAMERA) @ turn.T, -1, 0)
     u = np.stack([scale[0] * x, 1.0 - scale[1] * (1.0 - y) / fitted.lattice.aspect], -1)
+    stretched = np.array(scale)[:, None] * turn / math.sqrt(scale[0] * scale[1])
     turned = [
-        np.concatenate([w[..., :2] @ turn.T, w[..., 2:]], -1) for w in (queries.omega_i, queries.omega_o)
+        np.concatenate([w[..., :2] @ stretched.T, w[..., 2:]], -1) for w in (queries.omega_i, queries.omega_o)
     ]
+    turned = [w / np.linalg.norm(w, axis=-1, keepdims=True) for w in turned]
     arrays = (u, math.sqrt(scale[0] * scale[1]) * queries.sigma, *turned)
     wanted = fitted.evaluate(*(a.reshape(-1, *a.shape[2:]) for a in arrays))
     found = shown(plane(bsdf(folder, uv_scale=f"{scale[0]}, {scale[1]}"), to_uv)).reshape(-1, 3)
