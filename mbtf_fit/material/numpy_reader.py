@@ -23,8 +23,8 @@ OPERATIONS = {
     "half_vector": lambda omega_i, omega_o: unit(omega_i + omega_o),
     "stereographic": lambda omega: omega[:2] / (1 + omega[2]),
     "position": lambda u: 2 * (u % 1) - 1,
-    "transform": lambda x, function, scale, divisor=1.0, factor=1.0: (
-        factor * FUNCTIONS[function](scale * (x / divisor if divisor else 0 * x))
+    "transform": lambda x, function, scale, divisor=1.0, factor=1.0, most=np.inf: (
+        factor * np.minimum(FUNCTIONS[function](scale * (x / divisor if divisor else 0 * x)), most)
     ),
     "matrix": lambda x, rows: np.array(rows) @ x,
     "gate": lambda gate, x, floor, scale, plus=0.0, unit=1.0: (

@@ -140,9 +140,9 @@ def encode_directions(encoding: EncodingSection) -> tuple[list[Operation], Seque
 def color(x: str, network: NetworkSection, name: str = "value") -> list[Operation]:
     """Value in 1/sr of three outputs, or of six: YUV and a gate per color, as in the published code."""
     if network.output_channels == 3:
-        return [Transform(name, x, network.output_transform, factor="unit")]
+        return [Transform(name, x, network.output_transform, factor="unit", most="most")]
     return [
         Matrix("rgb", f"{x}[0:3]"),
-        Transform("ungated", "rgb", network.output_transform, factor="unit"),
+        Transform("ungated", "rgb", network.output_transform, factor="unit", most="most"),
         Gate(name, f"{x}[3:6]", "ungated", floor=GATE),
     ]

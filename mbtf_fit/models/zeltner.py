@@ -67,5 +67,5 @@ class Zeltner(Model):
                 outputs=3,
                 activation=network.activation,
             ),
-            Transform("value", "x", network.output_transform, factor="unit"),
+            Transform("value", "x", network.output_transform, factor="unit", most="most"),
         ]

@@ -14,7 +14,7 @@ Function = Literal["identity", "exp", "expm1", "log1p", "softplus", "sigmoid", "
 
 @dataclass(frozen=True)
 class Transform(Operation):
-    """A function of each number: ``factor · f(scale · x / divisor)``.
+    """A function of each number: ``factor · min(f(scale · x / divisor), most)``.
 
     ``expm1`` is exp(x) - 1, ``log1p`` log(1 + x), ``softplus`` log(1 + exp(x)), ``sigmoid`` 1 / (1 +
     exp(-x)), ``fourth-root`` the inverse x|x|³ of the fourth root. Where the divisor is 0, its quotient is
@@ -26,6 +26,7 @@ class Transform(Operation):
     function : f
     scale : number
     divisor, factor : tensors (), or None for 1
+    most : tensor (), or None for no bound
     """
 
     x: Value
@@ -33,6 +34,7 @@ class Transform(Operation):
     scale: float = 1.0
     divisor: TensorName | None = None
     factor: TensorName | None = None
+    most: TensorName | None = None
 
     def size(self, sizes: Sequence[int]) -> int:
         return sizes[0]

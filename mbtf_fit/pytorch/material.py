@@ -25,6 +25,8 @@ FEATURE_SCALE, FIRST_WEIGHT = 0.1, 0.9
 _SURFACE = (ops.Trace, ops.Shade)
 # Tensor of the calibration factors.
 CALIBRATION = "calibration"
+# Bound of learned values that have none, in units.
+UNBOUNDED = 1e30
 
 
 class NeuralMaterial(nn.Module):
@@ -64,6 +66,8 @@ class NeuralMaterial(nn.Module):
             self._create(op, sizes, moves=op.output in moving)
         for tensor in _scalars(operations):
             self.register_buffer(tensor, torch.ones(()))
+        for tensor in _bounds(operations):
+            self.number(tensor).fill_(UNBOUNDED)
         self.register_buffer(CALIBRATION, None)
 
     def _create(self, op: ops.Operation, sizes: Mapping[str, int], *, moves: bool) -> None:
@@ -99,12 +103,12 @@ class NeuralMaterial(nn.Module):
         self._buffers[CALIBRATION] = factors
         self._plans.clear()
 
-    def initialize(self, generator: torch.Generator, unit: float) -> None:
+    def initialize(self, generator: torch.Generator, unit: float, most: float = UNBOUNDED) -> None:
         """Initialize all parameters at random: textures that move no lookups, then the networks, the last one
         first.
 
         `unit` is a typical value of the data in 1/sr. Values are multiples of it, so that black data (0) are
-        fitted exactly.
+        fitted exactly. What is learned of them is bounded by `most` units.
         """
         for textures in self.textures():
             if textures.moves_lookups:
@@ -119,6 +123,8 @@ class NeuralMaterial(nn.Module):
                 last_bias.data[index] = start
         for tensor in _scalars(self._own):
             self.number(tensor).fill_(unit)
+        for tensor in _bounds(self._own):
+            self.number(tensor).fill_(most)
 
     def run(
         self, wanted: Sequence[str], given: Mapping[str, Tensor], grid: tuple[int, int] | None = None
@@ -383,8 +389,13 @@ def _check_surface(operations: Sequence[ops.Operation]) -> None:
             )
 
 
+def _bounds(operations: Sequence[ops.Operation]) -> set[str]:
+    """Tensors () of a list that bound values."""
+    return {op.most for op in operations if isinstance(op, ops.Transform) and op.most is not None}
+
+
 def _scalars(operations: Sequence[ops.Operation]) -> list[str]:
-    """Tensors () of a list: units of values."""
+    """Tensors () of a list: units of values, and their bounds."""
     named = {
         name for op in operations if isinstance(op, ops.Transform | ops.Gate) for name in op.named("tensor")
     }

@@ -277,6 +277,7 @@ def _transform(op: ops.Transform, run: Execution, x: Tensor) -> Tensor:
         divisor = run.material.number(op.divisor)
         x = torch.where(divisor > 0, x / torch.where(divisor > 0, divisor, 1.0), 0.0)
     value = FUNCTIONS[op.function][0](x if op.scale == 1.0 else op.scale * x)
+    value = value if op.most is None else torch.minimum(value, run.material.number(op.most))
     return value if op.factor is None else run.material.number(op.factor) * value
 
 

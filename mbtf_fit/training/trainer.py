@@ -30,7 +30,7 @@ from mbtf_fit.models.model import Model, Preparation
 from mbtf_fit.models.registry import material_of, model_class
 from mbtf_fit.native import kernel
 from mbtf_fit.objective.losses import Objective
-from mbtf_fit.objective.noise import NoiseModel, typical_value
+from mbtf_fit.objective.noise import NoiseModel, typical_value, value_bound
 from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Batch, Workers
 from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.pytorch.textures import annealed_sigma
@@ -341,8 +341,10 @@ def prepare_trainer(
     """A trainer at its first step, for the model and the data of a configuration; with the networks of the
     model `shared`, if there is one."""
     model = material_of(config.model, data.lattice, config.network)
-    unit = typical_value(mean_value(partition.sample.value_a, partition.sample.value_b))
-    model.initialize(torch.Generator().manual_seed(config.seed), unit)
+    first, second, *_ = partition.sample.halves
+    unit = typical_value(mean_value(first, second))
+    most = value_bound(first, second, unit)
+    model.initialize(torch.Generator().manual_seed(config.seed), unit, most)
 
     def load(folder: str) -> tuple[TrainingData, float]:
         other = open_data(folder, config.model, config.data.cache)

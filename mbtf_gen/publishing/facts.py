@@ -120,6 +120,6 @@ def name_of(manifest: Mapping[str, Any]) -> str:
     path = Path(manifest["measured"]["file"] if "measured" in manifest else manifest["config"]["material"])
     found = path.stem if path.suffix else path.name
     if path.stem.lower() in _GENERIC:
-        found = path.parent.name
+        found = path.parent.name or found
     words = re.sub(r"[^\w.]+|_+", " ", found if found.isprintable() else "").strip()
     return words or "material"

@@ -244,7 +244,6 @@ def _generated(
 ) -> tuple[Path, float]:
     """Folder of a new data set with (queries, paths of each) of both splits, and the seconds it took."""
     queries = {"train": str(train[0]), "spp": train[1], "test": str(test[0]), "test_spp": test[1]}
-    queries |= {"test_highlights": 0.0} if test == _NO_QUERIES else {}
     changes = {"seed": conditions.config.seed + seed, "queries": {**queries, "layout": "shuffled"}}
     data = deep_merge(conditions.config.model_dump(mode="json"), changes)
     folder = _own_folder(conditions) / f"data-{data_sha256(data)[:12]}"

@@ -80,6 +80,10 @@ class Study:
             return ""
         if self.least_run is not None:
             return no_run(self.least_run, self.least)
+        runs = [m.error for m in self.measurements if m.study == "run"]
+        if uncertain := sum(e.error >= e.value for e in runs):
+            longer = rounded_duration(2.0 * self.description["time"])
+            return f"errors of {uncertain} runs are not significant: repeat the command with --time {longer}"
         enough = self.least <= self.description["time"]
         how = "the same command" if enough else f"the command with --time {rounded_duration(self.least)}"
         return f"too few complete runs for a forecast: repeat {how}; it keeps these runs and adds others"

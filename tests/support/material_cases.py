@@ -42,6 +42,7 @@ CASES: dict[str, dict[str, Any]] = {
     },
     "learned heights": {"model": "neumip+"},
     "black": {"model": "relief", "weights": {"unit": torch.zeros(())}},
+    "bounded": {"model": "relief", "weights": {"most": torch.tensor(0.5)}},
     "rainer2019": {"model": "rainer2019"},
     "svbrdf": {"model": "svbrdf"},
     "zeltner2024": {"model": "zeltner2024", **net(width=12, layers=3)},

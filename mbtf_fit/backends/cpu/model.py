@@ -126,6 +126,7 @@ class NativeModel:
         """Copy the current weights, and the tables that lookups read."""
         library, variant = self.kernel.library, self.kernel.variant
         self.description.unit = float(self.material.number(self.pattern.unit))
+        self.description.most = float(self.material.number(self.pattern.most))
         for weights, (target, packed) in zip(self.network_weights(), self._packed, strict=True):
             held = [w.contiguous() for w in weights]
             library.mbtf_pack(variant, ctypes.byref(target), pointers(held), packed.data_ptr())

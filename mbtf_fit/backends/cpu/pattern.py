@@ -34,7 +34,7 @@ class Pattern:
     coordinates : of light and of view that the decoder reads
     half_vector, hints, frame : whether it reads those
     irradiance_scale : factor of the irradiance under the logarithm
-    unit : tensor of the unit
+    unit, most : tensors of the unit and of the bound
     gate : whether the value has a gated core
     factors : names of calibration factors that the value is multiplied by
     """
@@ -50,6 +50,7 @@ class Pattern:
     frame: bool
     irradiance_scale: float
     unit: str
+    most: str
     gate: bool
     factors: tuple[str, ...]
 
@@ -97,9 +98,9 @@ class _Matcher:
         gate = self._take(value, ops.Gate, floor=0.0, scale=2.0) if self._is(value, ops.Gate) else None
         own = value if gate is None else gate.plus or ""
         color = self._take(own, ops.Transform, function="expm1", scale=1.0, divisor=None)
-        unit = color.factor or ""
+        unit, most = color.factor or "", color.most or ""
         name, _, part = color.x.partition("[")
-        self._expect(part in ("", "0:3]"), unit != "")
+        self._expect(part in ("", "0:3]"), "" not in (unit, most))
         decoder = self._take(name, ops.Network, outputs=3 + (gate is not None), activation="relu")
         features, light, view, *rest = (*decoder.x, "", "", "")[: max(3, len(decoder.x))]
         lookup = self._take(features, ops.Lookup, level="level", blending="blend")
@@ -125,7 +126,7 @@ class _Matcher:
         self._expect(not rest, not self._unused)
         return Pattern(
             *(lookup, decoder, offset, network, displace, _LIGHTS[light, view], half, hints, frame),
-            *(scale, unit, gate is not None, tuple(factors)),
+            *(scale, unit, most, gate is not None, tuple(factors)),
         )
 
     def _moved(self, name: str) -> tuple[ops.Displace | None, ops.Offset | None, ops.Network | None]:

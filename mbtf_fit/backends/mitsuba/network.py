@@ -199,7 +199,13 @@ def _transform(op: ops.Transform, loader: Loader) -> Step:
     # A quotient by 0 is 0.
     scale = op.scale if divisor else 0.0
     factor = 1.0 if op.factor is None else opaque(loader.scalar(op.factor))
-    return lambda x: [factor * function(scale * (v / by)) for v in x]
+    most = None if op.most is None else opaque(loader.scalar(op.most))
+
+    def values(x: Numbers) -> Numbers:
+        found = [function(scale * (v / by)) for v in x]
+        return [factor * (v if most is None else dr.minimum(v, most)) for v in found]
+
+    return values
 
 
 @MITSUBA.implements(ops.Matrix)

@@ -260,7 +260,9 @@ def _transform(op: ops.Transform, code: Code, x: Value) -> list[str]:
         scale *= 1.0 / divisor if divisor > 0 else 0.0
     factor = "" if op.factor is None else f"{number(code.scalar(op.factor))} * "
     argument = "{}" if scale == 1.0 else f"({number(scale)} * {{}})"
-    return [factor + FUNCTIONS[op.function].format(argument.format(v)) for v in x.vectors()]
+    bounded = "{}" if op.most is None else f"min({{}}, {number(code.scalar(op.most))})"
+    found = [FUNCTIONS[op.function].format(argument.format(v)) for v in x.vectors()]
+    return [factor + bounded.format(v) for v in found]
 
 
 @SHADER.implements(ops.Matrix)

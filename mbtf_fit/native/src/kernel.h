@@ -46,7 +46,7 @@ typedef struct {
 typedef struct {
     mbtf_textures pyramid, offset_texture;
     mbtf_network decoder, offset;
-    float unit, offset_scale, grazing, aspect, irradiance_scale, height_scale, least_facing;
+    float unit, most, offset_scale, grazing, aspect, irradiance_scale, height_scale, least_facing;
     int32_t coordinates, half_vector, hints, frame, gate;
     const float *depth_weights;
 } mbtf_model;

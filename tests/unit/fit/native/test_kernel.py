@@ -40,10 +40,10 @@ def kernel_of(variant: str) -> Kernel:
 
 
 def random_model(name: str, lattice: Lattice, **network: Any) -> NeuralMaterial:
-    """A model with random parameters, biases and offset texture included."""
+    """A model with random parameters, biases and offset texture included; some values are at the bound."""
     model = build_model(name, lattice, **network)
     generator = torch.Generator().manual_seed(0)
-    model.initialize(generator, 0.1)
+    model.initialize(generator, 0.1, 1.0)
     with torch.no_grad():
         for p in model.parameters():
             p += 0.1 * torch.randn(p.shape, generator=generator)
@@ -185,6 +185,7 @@ def test_outputs_of_any_size_give_finite_values(variant: str) -> None:
     native, batch = NativeModel(kernel_of(variant), model), random_batch(1)
     loss = objective(losses=[{"kind": "squared"}], huber_delta=None)
     with torch.no_grad():
+        model.number("most").fill_(torch.inf)
         for p in model.parameters():
             p.zero_()
     for x in torch.from_numpy(answers.astype(np.float32)).view(-1, 1).expand(-1, 3):

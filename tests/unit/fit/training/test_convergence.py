@@ -207,7 +207,7 @@ def test_a_fit_that_kept_an_earlier_state_needs_more_queries() -> None:
     for doubling in (0.6, None, 1.5):
         found = next_step(MarginalCost(doubling, 0.4, 4000, 0.0, 480, 1.4, 50.0, 1.0), fitted(0.2, 0.002))
         assert found.kind == "queries"
-        assert "0.8 of this error" in found.reason
+        assert "0.8 to 1 of this error" in found.reason
     # Where no overfitting is left, the same error is expected of twice the queries.
     for share, kind in ((None, "none"), (0.08, "none"), (0.12, "queries")):
         step = next_step(MarginalCost(0.8, share, 4000, kept_step=1024), fitted(0.2, 0.002))
