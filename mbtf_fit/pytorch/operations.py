@@ -271,13 +271,19 @@ def _inception(
     return out.flatten(0, 2)
 
 
+def _bounded(value: Tensor, most: Tensor) -> Tensor:
+    """At most `most`; the gradient is that of the value, so that training lowers what lies beyond."""
+    bounded = torch.minimum(value, most)
+    return bounded.detach() + (value - value.detach()) if value.requires_grad else bounded
+
+
 @PYTORCH.implements(ops.Transform)
 def _transform(op: ops.Transform, run: Execution, x: Tensor) -> Tensor:
     if op.divisor is not None:
         divisor = run.material.number(op.divisor)
         x = torch.where(divisor > 0, x / torch.where(divisor > 0, divisor, 1.0), 0.0)
     value = FUNCTIONS[op.function][0](x if op.scale == 1.0 else op.scale * x)
-    value = value if op.most is None else torch.minimum(value, run.material.number(op.most))
+    value = value if op.most is None else _bounded(value, run.material.number(op.most))
     return value if op.factor is None else run.material.number(op.factor) * value
 
 
