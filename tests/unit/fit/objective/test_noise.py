@@ -11,7 +11,7 @@ from support.fit_data import parallax, random_queries
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.objective.noise import NoiseModel, typical_value
+from mbtf_fit.objective.noise import NoiseModel, typical_value, value_bound
 
 LATTICE = Lattice(3)
 
@@ -81,3 +81,13 @@ def test_the_typical_value_is_robust_to_outliers() -> None:
     rare = np.zeros((5000, 3))
     rare[7] = 100.0
     assert typical_value(rare) == pytest.approx(0.02)
+
+
+def test_the_bound_of_values_needs_both_estimates() -> None:
+    """A path of 500 in one estimate counts for nothing, a highlight in both does; noisy data have a bound."""
+    a, b = np.full((2, 100, 3), 0.1, np.float32)
+    a[7] = 500.0
+    assert value_bound(a, b, 0.1) == pytest.approx(10.0)
+    a[8], b[8] = 5.0, 6.0
+    assert value_bound(a, b, 0.1) == pytest.approx(100.0)
+    assert value_bound(a, b, 0.0) > 0
