@@ -33,19 +33,18 @@ _MOST_NOISE = 5.0
 # Fraction of the queries, the brightest, that the ratio omits: highlights, whose variance would hide the
 # noise of all others, and outliers.
 _BRIGHTEST = 0.01
-# Least bound of learned values, in units.
-_LEAST_BOUND = 10.0
+# Least and most bound of learned values, in units.
+_LEAST_BOUND, _MOST_BOUND = 10.0, 1e30
 
 
-def value_bound(a: ArrayLike, b: ArrayLike, unit: float) -> float:
-    """Bound of learned values in units: twice the largest value that both estimates (n, ...) of a query
-    confirm, so that no single path counts.
+def value_bound(values: ArrayLike, unit: float) -> float:
+    """Bound of learned values in units: twice the largest of training values (n, ...).
 
     Networks that learn logarithms may answer more by orders of magnitude between the directions of the data.
-    The factor is for highlights that no query meets at their peak, the least bound for noisy data.
+    The factor is for highlights that no query meets at their peak, the least bound for few queries.
     """
-    largest = float(np.minimum(a, b).max(initial=0.0))
-    return max(_LEAST_BOUND, 2.0 * largest / unit) if unit > 0.0 else _LEAST_BOUND
+    largest = 2.0 * float(np.max(values, initial=0.0))
+    return min(max(_LEAST_BOUND, largest / unit), _MOST_BOUND) if unit > 0.0 else _LEAST_BOUND
 
 
 def typical_value(values: ArrayLike) -> float:

@@ -341,10 +341,9 @@ def prepare_trainer(
     """A trainer at its first step, for the model and the data of a configuration; with the networks of the
     model `shared`, if there is one."""
     model = material_of(config.model, data.lattice, config.network)
-    first, second, *_ = partition.sample.halves
-    unit = typical_value(mean_value(first, second))
-    most = value_bound(first, second, unit)
-    model.initialize(torch.Generator().manual_seed(config.seed), unit, most)
+    values = mean_value(partition.sample.value_a, partition.sample.value_b)
+    unit = typical_value(values)
+    model.initialize(torch.Generator().manual_seed(config.seed), unit, value_bound(values, unit))
 
     def load(folder: str) -> tuple[TrainingData, float]:
         other = open_data(folder, config.model, config.data.cache)
