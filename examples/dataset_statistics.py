@@ -18,7 +18,7 @@ from mbtf_gen import Dataset
 
 train, test = (Dataset.open("shards").load(split) for split in ("train", "test"))
 a, b = test["value_a"], test["value_b"]
-# Weights of test queries that are drawn by highlights (of glossy materials).
+# Weights of test queries that are drawn by highlights (of glossy materials and cloth).
 weight = test.get("weight")
 levels = level_groups(test["sigma"])
 

@@ -65,9 +65,7 @@ class NeuralMaterial(nn.Module):
         for op in reversed(operations):
             self._create(op, sizes, moves=op.output in moving)
         for tensor in _scalars(operations):
-            self.register_buffer(tensor, torch.ones(()))
-        for tensor in _bounds(operations):
-            self.number(tensor).fill_(UNBOUNDED)
+            self.register_buffer(tensor, torch.full((), UNBOUNDED if tensor in _bounds(operations) else 1.0))
         self.register_buffer(CALIBRATION, None)
 
     def _create(self, op: ops.Operation, sizes: Mapping[str, int], *, moves: bool) -> None:
@@ -122,9 +120,7 @@ class NeuralMaterial(nn.Module):
             for index, start in starts.get(name, {}).items():
                 last_bias.data[index] = start
         for tensor in _scalars(self._own):
-            self.number(tensor).fill_(unit)
-        for tensor in _bounds(self._own):
-            self.number(tensor).fill_(most)
+            self.number(tensor).fill_(most if tensor in _bounds(self._own) else unit)
 
     def run(
         self, wanted: Sequence[str], given: Mapping[str, Tensor], grid: tuple[int, int] | None = None

@@ -143,17 +143,13 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
         reason = f"{cost.steps} steps are few" if few else "it is unknown what longer training gains"
         return NextStep("time", f"{reason}; try twice the training")
     if time < FLAT or few:
-        return NextStep("time", f"{_about(time)} after twice the training")
+        return NextStep("time", f"expect about {time:.2g} of this error after twice the training")
     return NextStep("none", _NO_GAIN)
 
 
 def _at_best(factor: float) -> str:
     # Of cloth by few noisy queries, twice as many have left 0.69 to 0.99 of the error.
     return f"expect {factor:.2g} to 1 of this error with twice the queries"
-
-
-def _about(factor: float) -> str:
-    return f"expect about {factor:.2g} of this error"
 
 
 def _flags(options: Mapping[str, str], section: str) -> list[str]:

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.content import F64, I64, MeshShape, joined
 from mbtf_core.meshes.read import read_mesh_content
-from mbtf_gen.pictures.shapes import mitsuba_mesh
-from mbtf_gen.tile.heights import MOST_CELLS, HeightGrid
+from mbtf_gen.pictures.shapes import check_cells, mitsuba_mesh
+from mbtf_gen.tile.heights import HeightGrid
 
 # Half cells that are cut at once.
 _PASS = 1 << 20
@@ -106,13 +106,7 @@ class DisplacedMesh:
             return mitsuba_mesh("shape", bsdf, self.position, self._uv(self.tile), self.faces, self.normal)
         cells = self._texels(grid)
         count = int(np.abs(_areas(cells, self.faces)).sum()) + len(self.faces)
-        if count > MOST_CELLS:
-            fits = int(grid.z.shape[1] * (MOST_CELLS / count) ** 0.5)
-            raise InputError(
-                f"the mesh has {count:,} cells; at most {MOST_CELLS:,} can be traced",
-                where="--mesh",
-                hint=f"give --mesh {fits}, or fewer --tiles-per-uv",
-            )
+        check_cells("mesh", count, grid.z.shape[1])
         parts = np.concatenate([self._displaced(grid, cells, *p) for p in _pieces(cells, self.faces)])
         position, uv = parts[..., :3].reshape(-1, 3), parts[..., 3:].reshape(-1, 2)
         faces = np.arange(len(position)).reshape(-1, 3)

@@ -106,13 +106,7 @@ class Chart:
         rows, columns = (round(cells * self.aspect), cells) if grid is None else grid.z.shape
         low, high = (round(end / self.aspect * rows) for end in self.along)
         across = self.around * columns
-        count = (high - low) * across
-        if count > MOST_CELLS:
-            raise InputError(
-                f"the {self.shape} has {count:,} cells; at most {MOST_CELLS:,} can be traced",
-                where="--mesh",
-                hint=f"give --mesh {int(columns * (MOST_CELLS / count) ** 0.5)}, or fewer --tiles-per-uv",
-            )
+        check_cells(self.shape, (high - low) * across, columns)
         i, j = np.arange(across + 1), np.arange(low, high + 1)
         x, y = (i + 0.5) / columns, ((j + 0.5) / rows) * self.aspect
         p, n, width = self.at(x[None], y[:, None])
@@ -129,6 +123,16 @@ class Chart:
 
 def _around(azimuth: F64, radius: F64, z: F64) -> F64:
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z], -1)
+
+
+def check_cells(surface: str, count: int, columns: int) -> None:
+    """Refuse a displaced surface of too many cells, for tiles of so many columns."""
+    if count > MOST_CELLS:
+        raise InputError(
+            f"the {surface} has {count:,} cells; at most {MOST_CELLS:,} can be traced",
+            where="--mesh",
+            hint=f"give --mesh {int(columns * (MOST_CELLS / count) ** 0.5)}, or fewer --tiles-per-uv",
+        )
 
 
 def mitsuba_mesh(

@@ -29,6 +29,11 @@ def _work(run: Measurement) -> float:
     return run.details["generation_seconds"] + run.details["training_seconds"]
 
 
+def is_significant(run: Measurement) -> bool:
+    """Whether the error of a run exceeds its standard error; others are no evidence."""
+    return run.error.value > 0 and run.error.error < run.error.value
+
+
 @dataclass(frozen=True)
 class Evidence:
     """Complete runs of a study with the same share of generating, the shortest first.
@@ -47,7 +52,7 @@ class Evidence:
     @classmethod
     def of(cls, found: Sequence[Measurement], deviation: Estimate) -> Evidence:
         """From the measurements of a study."""
-        runs = [m for m in found if m.study == "run" and m.error.value > 0 and m.error.error < m.error.value]
+        runs = [m for m in found if m.study == "run" and is_significant(m)]
         slow = [m for m in runs if m.series == SLOW_SERIES]
         runs = [m for m in runs if m.series != SLOW_SERIES]
         for series, _ in Counter(m.series for m in runs).most_common(1):

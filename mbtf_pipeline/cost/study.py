@@ -25,7 +25,7 @@ from mbtf_core.run.task import Item
 from mbtf_core.stats import Estimate
 from mbtf_core.units import expectation, format_duration, rounded_duration
 from mbtf_gen.job import Job
-from mbtf_pipeline.cost.answers import Evidence
+from mbtf_pipeline.cost.answers import Evidence, is_significant
 from mbtf_pipeline.cost.conditions import (
     CONFIG_NAME,
     conditions_of,
@@ -80,8 +80,8 @@ class Study:
             return ""
         if self.least_run is not None:
             return no_run(self.least_run, self.least)
-        runs = [m.error for m in self.measurements if m.study == "run"]
-        if uncertain := sum(e.error >= e.value for e in runs):
+        runs = [m for m in self.measurements if m.study == "run"]
+        if uncertain := sum(not is_significant(run) for run in runs):
             longer = rounded_duration(2.0 * self.description["time"])
             return f"errors of {uncertain} runs are not significant: repeat the command with --time {longer}"
         enough = self.least <= self.description["time"]
