@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from mbtf_core.data.dataset import Dataset
+    from mbtf_fit.data.queries import ShardQueries
     from mbtf_fit.pytorch.material import NeuralMaterial
 
 # Options that only some models have, by dotted key; :attr:`Model.takes` names those of a model.
@@ -48,6 +49,7 @@ class Preparation:
     ----------
     data : the data set
     queries : the training queries, on the device
+    sample : a random sample of them
     training : options
     unit : typical value of the data in 1/sr
     seed : of the fit
@@ -56,6 +58,7 @@ class Preparation:
 
     data: Dataset
     queries: Any
+    sample: ShardQueries
     training: TrainingSection
     unit: float
     seed: int

@@ -272,9 +272,14 @@ def _inception(
 
 
 def _bounded(value: Tensor, most: Tensor) -> Tensor:
-    """At most `most`; the gradient is that of the value, so that training lowers what lies beyond."""
+    """At most `most`. Training lowers what lies beyond, and never raises it: there, the positive part of the
+    gradient is left."""
     bounded = torch.minimum(value, most)
-    return bounded.detach() + (value - value.detach()) if value.requires_grad else bounded
+    if not value.requires_grad:
+        return bounded
+    bounded, beyond = bounded.detach() + (value - value.detach()), value.detach() > most
+    bounded.register_hook(lambda gradient: gradient.masked_fill(beyond & (gradient < 0), 0.0))
+    return bounded
 
 
 @PYTORCH.implements(ops.Transform)

@@ -20,9 +20,10 @@ from mbtf_core.stats import Estimate, mse_difference, noise_free_mse, signal_var
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.training.trainer import TrainingProgress
 
-# Standard errors that make a difference significant: the best of many states is compared. Its least share of
-# the best error: paired errors resolve differences that do not matter.
-_SIGNIFICANT, _LEAST = 3.0, 0.05
+# Standard errors that make a difference significant. A single false highlight, which is how fits of gloss
+# overfit, makes a difference of one standard error, however bright it is. Its least share of the best error:
+# paired errors resolve differences that do not matter.
+_SIGNIFICANT, _LEAST = 1.5, 0.05
 # Steps of the first state that may be kept, and how many there are until twice the steps.
 _FIRST, _PER_OCTAVE = 32, 2
 

@@ -352,7 +352,8 @@ def prepare_trainer(
         return part.training.to(device), typical
 
     hooks, training = model_class(config.model)(model), partition.training.to(device)
-    training = hooks.prepare(Preparation(data, training, config.training, unit, config.seed, load))
+    given = Preparation(data, training, partition.sample, config.training, unit, config.seed, load)
+    training = hooks.prepare(given)
     if config.init_from is not None:
         _initialize_from(hooks, config.init_from)
     if config.decoder is not None:
