@@ -131,8 +131,9 @@ def _placements(file: GltfFile) -> dict[int, F64]:
         if node.mesh is not None:
             mesh = file.entry(document.meshes, node.mesh, "meshes")
             _check_pose(node, mesh, file)
-            instancing = node.extensions.instancing
-            own = matrix[None] if instancing is None else matrix @ _instance_matrices(file, instancing)
+            own = matrix[None]
+            if node.instancing is not None:
+                own = matrix @ _instance_matrices(file, node.instancing)
             found.setdefault(node.mesh, []).append(own)
         waiting += [(child, matrix) for child in reversed(node.children)]
     outside = sum(node.mesh is not None for index, node in enumerate(nodes) if index not in seen)
