@@ -1,6 +1,6 @@
 """Draw the figures of docs/explanation/concepts.md: ``.venv/bin/python docs/drawings/make_drawings.py``.
 
-The curves come from the project's own code (light kernel, level weights), so drawings and programs agree.
+The curves come from the project's own code (light kernel, levels), so drawings and programs agree.
 """
 
 from __future__ import annotations
