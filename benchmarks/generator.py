@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import argparse
 import statistics
+import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -50,6 +51,10 @@ from mbtf_gen.tile.loading import load_material
 if TYPE_CHECKING:
     from mbtf_gen.render.path_tracer import Transport
     from mbtf_gen.render.scene import TileScene
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from support.mitsuba_shapes import mitsuba_shapes
 
 MESH = 512
 DEPTH = 6
@@ -144,7 +149,7 @@ def mitsuba_run(material: Tile, count: int, spp: int, depth: int, roulette: int)
                     "film": {"type": "hdrfilm", "rfilter": {"type": "box"}, **size},
                 },
                 "light": {"type": "directional", "direction": [-0.5, -0.5, -0.707]},
-                **material.mitsuba_shapes(unit, Path(folder), material.surface()),  # type: ignore[arg-type]
+                **mitsuba_shapes(material, unit, Path(folder), material.surface()),  # type: ignore[arg-type]
             }
         )
 

@@ -1,6 +1,6 @@
 """Draw the figures of docs/explanation/concepts.md: ``.venv/bin/python docs/drawings/make_drawings.py``.
 
-The curves come from the project's own code (light kernel, level weights), so drawings and programs agree.
+The curves come from the project's own code (light kernel, levels), so drawings and programs agree.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_core.data.lattice import Lattice
+from mbtf_core.data.lattice import level_of_sigma
 from mbtf_gen.sampling.light_kernel import LightKernel
 
 FOLDER = Path(__file__).parent
@@ -115,8 +115,7 @@ def orientation(plot: Any) -> Any:
 def footprint(plot: Any) -> Any:
     """Footprints of three levels on the finest texels, and the weights of the levels."""
     figure, (left, right) = plot.subplots(1, 2, figsize=(9, 3.2), width_ratios=(1, 1.6))
-    lattice = Lattice(4, 1.0)
-    n = 2**lattice.finest
+    n = 16
     for k in range(n + 1):
         left.plot([0, 1], [k / n, k / n], color="#d5d5d5", lw=0.6)
         left.plot([k / n, k / n], [0, 1], color="#d5d5d5", lw=0.6)
@@ -128,9 +127,10 @@ def footprint(plot: Any) -> Any:
     left.set_title("1 σ of levels 1, 2 and 4 on level 4's texels", fontsize=9)
     bare(left)
     sigma = np.exp2(-np.linspace(0, 4, 801)) / 2
-    lower, upper, weight = lattice.blend(sigma)
+    fractional = level_of_sigma(sigma)
     for level in range(5):
-        share = np.where(lower == level, 1 - weight, 0) + np.where(upper == level, weight, 0)
+        # Between adjacent levels, footprints are interpolated.
+        share = np.maximum(1 - np.abs(fractional - level), 0)
         right.plot(
             sigma, share, lw=1.8, color=(BLUE, ORANGE, GREEN, "#CC79A7", RED)[level], label=f"level {level}"
         )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -19,7 +19,7 @@ from mbtf_core.data.folder import DataFolder, sidecar_name
 from mbtf_core.data.lattice import MAX_LEVEL
 from mbtf_core.data.schema import FORMAT_NAME, MANIFEST_NAME, SCHEMA_VERSION, Layout, ShardEntry
 from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import Stored, data_sha256
+from mbtf_core.files.atomic import data_sha256
 
 _Count = Annotated[int, Field(strict=True, ge=0, lt=1 << 40)]
 _FileName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*\.(npz|exr)$", max_length=100)]
@@ -98,28 +98,56 @@ class TargetReached:
     square: float
 
 
-class _Statistics(BaseModel, allow_inf_nan=False):
+class Statistics(BaseModel, allow_inf_nan=False):
+    """Means over the queries of a shard, by channel; measured values have no variance."""
+
     mean_value: tuple[float, float, float]
     mean_variance: tuple[float, float, float] | None
 
 
-class _Quarantined(BaseModel):
-    nonfinite_samples: int
-    nonfinite_at: list[BadSample]
-    lost_rays: int
-    capped_rays: int
+class Quarantined(BaseModel):
+    """Samples that are not stored."""
+
+    nonfinite_samples: int = 0
+    lost_rays: int = 0
+    capped_rays: int = 0
+    nonfinite_at: list[BadSample] = []
 
 
-class _Sidecar(BaseModel, allow_inf_nan=False):
-    """Keys of a sidecar, besides those that :func:`read_sidecar` compares."""
+class Sidecar(BaseModel, allow_inf_nan=False):
+    """Content of the sidecar of a shard.
 
+    Attributes
+    ----------
+    config_hash, plan : digests of the configuration and of the run plan
+    file, split, index, rows : as the manifest lists the shard
+    bytes, sha256 : of the shard's file
+    seed : root seed, split and shard that the random numbers follow from
+    spp : planned paths of a query; None of measured values
+    queries, paths, seconds : number of queries, paths traced, duration of the rendering
+    target : error reached under a target error
+    """
+
+    config_hash: str
+    plan: str
+    file: str
+    split: str
+    index: int
+    rows: int
+    bytes: int
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    seed: dict[str, int | str]
+    spp: int | None
     queries: int
     paths: int
     seconds: float
-    statistics: _Statistics
-    quarantined: _Quarantined
+    quarantined: Quarantined
     target: TargetReached | None
+    statistics: Statistics
+
+    def as_dict(self) -> dict[str, Any]:
+        """The document, without its checksum."""
+        return {"format": FORMAT_NAME, "schema": SCHEMA_VERSION, **self.model_dump()}
 
 
 def software_versions() -> dict[str, str]:
@@ -170,7 +198,7 @@ def read_sidecar(folder: DataFolder, entry: ShardEntry, config_hash: str) -> dic
             raise InputError(fault, where=where)
     try:
         record = folder.read_checksummed(sidecar)
-        check_document(_Sidecar, record, folder.at(sidecar), "")
+        check_document(Sidecar, record, folder.at(sidecar), "")
     except InputError as error:
         raise InputError(f"has a corrupt sidecar: {error.what}", where=where) from None
     if record.get("format") != FORMAT_NAME or record.get("config_hash") != config_hash:
@@ -192,53 +220,6 @@ def finished_record(folder: DataFolder, entry: ShardEntry, config_hash: str) -> 
         return read_sidecar(folder, entry, config_hash)
     except (InputError, OSError):
         return None
-
-
-def sidecar(
-    entry: ShardEntry,
-    stored: Stored,
-    *,
-    config_hash: str,
-    plan: str,
-    seed: int,
-    spp: int | None,
-    queries: int,
-    paths: int,
-    seconds: float,
-    quarantined: dict[str, Any],
-    target: dict[str, Any] | None,
-    mean_value: list[float],
-    mean_variance: list[float] | None,
-) -> dict[str, Any]:
-    """Content of the sidecar of a shard.
-
-    Parameters
-    ----------
-    stored : size and digest of the shard's file
-    config_hash, plan : digests of the configuration and of the run plan
-    seed : root seed
-    spp : planned paths of a query; None of measured values
-    queries, paths, seconds : number of queries, paths traced, duration of the rendering
-    quarantined : samples that are not stored
-    target : error reached under a target error
-    mean_value, mean_variance : over the queries, by channel; no variance of measured values
-    """
-    return {
-        "format": FORMAT_NAME,
-        "schema": SCHEMA_VERSION,
-        "config_hash": config_hash,
-        "plan": plan,
-        **{key: getattr(entry, key) for key in ("file", "split", "index", "rows")},
-        **asdict(stored),
-        "seed": {"root": seed, "split": entry.split, "shard": entry.index},
-        "spp": spp,
-        "queries": queries,
-        "paths": paths,
-        "seconds": seconds,
-        "quarantined": quarantined,
-        "target": target,
-        "statistics": {"mean_value": mean_value, "mean_variance": mean_variance},
-    }
 
 
 def upload_waiting(

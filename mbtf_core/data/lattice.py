@@ -104,23 +104,6 @@ class Lattice:
         """Footprints of the finest level and of level 0, in tile widths."""
         return float(sigma_of_level(self.finest)), float(sigma_of_level(0))
 
-    def blend(self, sigma: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-        """Adjacent levels between which footprints are interpolated; levels are clamped to [0, k].
-
-        Parameters
-        ----------
-        sigma : standard deviations in tile widths, any shape
-
-        Returns
-        -------
-        coarse, fine : int64 arrays
-        weight : float64 array
-            Weight of the finer level, ``frac(l)``.
-        """
-        level = np.clip(level_of_sigma(sigma), 0.0, self.finest)
-        coarse = np.minimum(np.floor(level), max(self.finest - 1, 0)).astype(np.int64)
-        return coarse, np.minimum(coarse + 1, self.finest), level - coarse
-
 
 def texel_centers(rows: int, columns: int) -> NDArray[np.float64]:
     """uv of the texel centers of a map, shape (rows, columns, 2): row 0 is the side ``v → 1``."""

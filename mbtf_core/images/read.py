@@ -61,8 +61,8 @@ _MAGIC = {
 }
 # Compressions of BMP, whose decoder is slow and fills whatever a small file leaves out.
 _RUN_LENGTHS = (1, 2)
-# Channels of PNG color types of more than one channel.
-_PNG_COLORS = {2: 3, 4: 2, 6: 4}
+# Channels of 16-bit colors by Pillow's name of them, of which it keeps the upper eight bits.
+_DEEP_PNG = {"RGB;16B": 3, "LA;16B": 2, "RGBA;16B": 4}
 SUFFIXES = tuple(_KINDS)
 
 
@@ -277,8 +277,6 @@ def _from_pillow(path: Path, kind: str, max_pixels: int) -> Image:
     codes, tags = None, None
     if kind == "TIFF":
         codes, tags = read_tiff(path, max_pixels)
-    elif kind == "PNG":
-        codes = _deep_png(path, max_pixels)
     elif kind == "JPEG" and (scans := path.read_bytes().count(b"\xff\xda")) > _MOST_SCANS:
         raise InputError(
             f"has {scans} scans; at most {_MOST_SCANS} are read", where=path, hint="save it anew"
@@ -296,10 +294,15 @@ def _from_pillow(path: Path, kind: str, max_pixels: int) -> Image:
             python_warnings.simplefilter("ignore")
             if tags is None or codes is None:
                 with reader(path) as picture:
-                    check_size(path, picture.height, picture.width, max_pixels, len(picture.getbands()))
+                    deep = _DEEP_PNG.get(picture.tile[0][3]) if kind == "PNG" else None
+                    size = 2 * deep if deep else len(picture.getbands())
+                    check_size(path, picture.height, picture.width, max_pixels, size)
                     if kind == "BMP" and picture.info.get("compression") in _RUN_LENGTHS:
                         raise InputError("has run lengths", where=path, hint="save it without compression")
-                    codes = _codes(picture, path) if codes is None else codes
+                    if deep:
+                        codes = _deep_png(path, picture.height, picture.width, deep)
+                    elif codes is None:
+                        codes = _codes(picture, path)
                     png = path if kind == "PNG" else None
                     tags = tags or pillow_tags(picture.info, picture.getexif(), png)
     except InputError:
@@ -310,24 +313,12 @@ def _from_pillow(path: Path, kind: str, max_pixels: int) -> Image:
     return _decoded(codes, path, tags=tags)
 
 
-def _deep_png(path: Path, max_pixels: int) -> NDArray[np.uint16] | None:
-    """Codes (H, W, C) of a 16-bit color PNG, of which Pillow keeps the upper eight bits; None of others."""
-    with path.open("rb") as stream:
-        head = stream.read(33)
-    if len(head) < 33 or head[12:16] != b"IHDR":
-        return None
-    columns, rows = int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
-    channels = _PNG_COLORS.get(head[25])
-    check_size(path, rows, columns, max_pixels, (channels or 1) * (2 if head[24] == 16 else 1))
-    if head[24] != 16 or channels is None:
-        return None
+def _deep_png(path: Path, rows: int, columns: int, channels: int) -> NDArray[np.uint16]:
+    """Codes (H, W, C) of a 16-bit color PNG."""
     import imagecodecs
 
-    try:
-        with silenced():
-            codes = imagecodecs.png_decode(path.read_bytes())
-    except Exception as error:  # a damaged file may make the decoder raise anything
-        raise InputError(f"cannot be read as a PNG image ({reason(error)})", where=path) from None
+    with silenced():
+        codes = imagecodecs.png_decode(path.read_bytes())
     # The decoder turns a transparent color into an alpha channel, which is left out.
     return np.ascontiguousarray(codes.reshape(rows, columns, -1)[..., :channels])
 

@@ -65,7 +65,7 @@ class Companions:
                 self.files[name] = found
                 return found
         raise InputError(
-            f"the file '{name}' that it names is missing", where=self.path, hint=f"put it into {folder}"
+            f"the file '{name[:200]}' that it names is missing", where=self.path, hint=f"put it into {folder}"
         )
 
     def color(self, name: str) -> NDArray[np.float32]:

@@ -131,8 +131,9 @@ def _placements(file: GltfFile) -> dict[int, F64]:
         if node.mesh is not None:
             mesh = file.entry(document.meshes, node.mesh, "meshes")
             _check_pose(node, mesh, file)
-            instancing = node.extensions.instancing
-            own = matrix[None] if instancing is None else matrix @ _instance_matrices(file, instancing)
+            own = matrix[None]
+            if node.instancing is not None:
+                own = matrix @ _instance_matrices(file, node.instancing)
             found.setdefault(node.mesh, []).append(own)
         waiting += [(child, matrix) for child in reversed(node.children)]
     outside = sum(node.mesh is not None for index, node in enumerate(nodes) if index not in seen)
@@ -194,17 +195,14 @@ def _instance_matrices(file: GltfFile, instancing: GltfInstancing) -> F64:
 
 def _transforms(translation: F64, rotation: F64, scale: F64, file: GltfFile) -> F64:
     """Matrices (k, 4, 4) from translations (k, 3), quaternions (k, 4) and scales (k, 3)."""
-    length = np.linalg.norm(rotation, axis=1, keepdims=True)
-    wrong = ~(np.abs(length[:, 0] - 1.0) < _UNIT)
+    from scipy.spatial.transform import Rotation
+
+    wrong = ~(np.abs(np.linalg.norm(rotation, axis=1) - 1.0) < _UNIT)
     if wrong.any():
         text = ", ".join(f"{number:g}" for number in rotation[wrong][0])
         raise InputError(f"the rotation {text} is no unit quaternion", where=file.path)
-    x, y, z, w = (rotation / length).T
     out = np.zeros((len(translation), 4, 4))
-    out[:, 0, :3] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=-1)
-    out[:, 1, :3] = np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=-1)
-    out[:, 2, :3] = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=-1)
-    out[:, :3, :3] *= scale[:, None, :]
+    out[:, :3, :3] = Rotation.from_quat(rotation).as_matrix() * scale[:, None, :]
     out[:, :3, 3] = translation
     out[:, 3, 3] = 1.0
     return out

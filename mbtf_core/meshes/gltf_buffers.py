@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import base64
 import binascii
-import json
 import re
+from codecs import BOM_UTF8
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.config.settings import build
-from mbtf_core.errors import InputError, reason
+from mbtf_core.errors import InputError
+from mbtf_core.files.atomic import parse_json
+from mbtf_core.meshes.companions import Companions
 from mbtf_core.meshes.content import F64, MOST_TRIANGLES
 from mbtf_core.meshes.gltf_schema import GltfAccessor, GltfDocument
 from mbtf_core.meshes.numbers import read_bytes
@@ -54,7 +56,7 @@ READ = {
 }
 
 
-class GltfFile:
+class GltfFile(Companions):
     """A glTF document and its data, read on demand.
 
     Parameters
@@ -65,8 +67,7 @@ class GltfFile:
     ----------
     document : its parts that are read
     extensions : names of all extensions that it uses, sorted
-    files : files besides `path` that were read, by URI
-    warnings : what is not used
+    files, warnings : files besides `path` that were read, by name, and what is not used
 
     Raises
     ------
@@ -74,17 +75,10 @@ class GltfFile:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.files: dict[str, Path] = {}
-        self.warnings: list[str] = []
+        super().__init__(path)
         content = read_bytes(path)
         text, self._chunk = _chunks(content, path) if content.startswith(_MAGIC) else (content, None)
-        try:
-            data = json.loads(text.decode("utf-8-sig"), parse_constant=_refuse_constant)
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"is no valid glTF ({reason(error)})", where=path) from None
-        if not isinstance(data, dict):
-            raise InputError("is no valid glTF (no JSON object)", where=path)
+        data = parse_json(text.removeprefix(BOM_UTF8), path)
         asset = data.get("asset")
         version = str(asset.get("version")) if isinstance(asset, dict) else "without a version"
         if version.partition(".")[0] != "2":
@@ -148,17 +142,12 @@ class GltfFile:
         if _SCHEME.match(uri) and not re.match(r"[A-Za-z]:[\\/]", uri):
             what = f"names '{uri[:80]}', which is no file beside it"
             raise InputError(what, where=self.path, hint="save it beside the file and name it there")
-        # Names are percent-encoded; some programs forget that, or write the separators of Windows.
-        plain = unquote(uri)
-        names = dict.fromkeys((plain, uri, plain.replace("\\", "/")))
         try:
-            places = [self.path.parent / name for name in names]
-            path = next((place for place in places if place.is_file()), places[0])
-            content = read_bytes(path)
-        except ValueError:
-            raise InputError(f"names a file that cannot exist ('{uri[:80]}')", where=self.path) from None
-        self.files[uri] = path
-        return content, path
+            path = self.find(unquote(uri))
+        except InputError:
+            # Some programs forget to encode names.
+            path = self.find(uri)
+        return read_bytes(path), path
 
     def _buffer(self, index: int) -> Bytes:
         if index not in self._buffers:
@@ -236,10 +225,6 @@ def _chunks(content: bytes, path: Path) -> tuple[bytes, bytes | None]:
     if _JSON not in found:
         raise InputError("is damaged: it has no JSON chunk", where=path)
     return found[_JSON], found.get(_BINARY)
-
-
-def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is not a JSON number")
 
 
 def _extensions(data: Any) -> Iterator[str]:

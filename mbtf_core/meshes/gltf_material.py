@@ -104,7 +104,7 @@ class Materials:
                 values[role] = self._value(source, places, material)
             except InputError as error:
                 faults[role] = error
-        if material.extensions.specular_glossiness is not None and material.pbrMetallicRoughness is None:
+        if material.specular_glossiness is not None and material.pbrMetallicRoughness is None:
             what = f"material '{material.name}' has only specular and glossiness"
             fault = InputError(what, where=self.file.path, hint="export it with metallic and roughness")
             faults |= dict.fromkeys(("base_color", "roughness", "metallic"), fault)
@@ -122,9 +122,9 @@ class Materials:
 
     def _sources(self, material: GltfMaterial) -> dict[str, _Source]:
         """By role."""
-        base, more = material.pbrMetallicRoughness or GltfMetallicRoughness(), material.extensions
+        base = material.pbrMetallicRoughness or GltfMetallicRoughness()
         color, alpha = np.array(base.baseColorFactor[:3]), base.baseColorFactor[3]
-        rough, coat, sheen = base.metallicRoughnessTexture, more.clearcoat, more.sheen
+        rough, coat, sheen = base.metallicRoughnessTexture, material.clearcoat, material.sheen
         found = {"base_color": _Source(color, base.baseColorTexture, encoded=True)}
         if material.alphaMode != "OPAQUE":
             found["opacity"] = _Source(alpha, base.baseColorTexture, _A)
@@ -216,7 +216,7 @@ class Materials:
 def _specular(material: GltfMaterial) -> _Source:
     """The dielectric lobe: its F0 is ``min(1, c·((n-1)/(n+1))²)·w`` with the color c, the weight w and the
     index of refraction n."""
-    index, lobe = material.extensions.ior.ior, material.extensions.specular
+    index, lobe = material.ior.ior, material.specular
     reflectance = ((index - 1.0) / (index + 1.0)) ** 2  # 1 for the index 0, as the extension demands
     color = float(np.dot(lobe.specularColorFactor, LUMINANCE))
     factor = min(1.0, reflectance * color) * lobe.specularFactor / _SPECULAR_REFLECTANCE
@@ -227,7 +227,7 @@ def _specular(material: GltfMaterial) -> _Source:
 
 def _transform(info: GltfTextureInfo) -> F64:
     """Matrix (3, 3) of ``KHR_texture_transform``, v down. Its rotation turns the image clockwise."""
-    given = info.extensions.transform
+    given = info.transform
     c, s = np.cos(given.rotation), np.sin(given.rotation)
     scaled = np.array([[c, s], [-s, c]]) * given.scale
     return np.array([[*scaled[0], given.offset[0]], [*scaled[1], given.offset[1]], [0.0, 0.0, 1.0]])
@@ -235,16 +235,16 @@ def _transform(info: GltfTextureInfo) -> F64:
 
 def _unused(material: GltfMaterial) -> Iterator[str]:
     """What of a material is not used, or not exactly, in words."""
-    base, more = material.pbrMetallicRoughness or GltfMetallicRoughness(), material.extensions
-    if material.normalTexture is not None or more.clearcoat.clearcoatNormalTexture is not None:
+    base, sheen = material.pbrMetallicRoughness or GltfMetallicRoughness(), material.sheen
+    if material.normalTexture is not None or material.clearcoat.clearcoatNormalTexture is not None:
         yield "normal textures are not used"
     if material.occlusionTexture is not None:
         yield "occlusion textures are not used: occlusion is simulated"
     if any(material.emissiveFactor):
         yield "emission is not used"
-    if any(more.sheen.sheenColorFactor) and more.sheen.sheenRoughnessFactor < _SMALLEST_SHEEN:
+    if any(sheen.sheenColorFactor) and sheen.sheenRoughnessFactor < _SMALLEST_SHEEN:
         yield f"sheen of a roughness below {_SMALLEST_SHEEN} is simulated with {_SMALLEST_SHEEN}"
-    lobe = more.specular
+    lobe = material.specular
     if base.metallicFactor == 1.0 and base.metallicRoughnessTexture is None:
         return  # metal alone
     if lobe.specularColorTexture is not None or len(set(lobe.specularColorFactor)) > 1:

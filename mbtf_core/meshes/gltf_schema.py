@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AliasPath, BaseModel, ConfigDict, Field
 
 # Numbers are no texts and no booleans.
 Number = Annotated[float, Field(strict=True)]
@@ -25,6 +25,11 @@ Matrix = Annotated[list[Number], Field(min_length=16, max_length=16)]
 
 class _Object(BaseModel):
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+
+def _extension(name: str, default: Any) -> Any:
+    """A property of an object that is one of its extensions."""
+    return Field(default, validation_alias=AliasPath("extensions", name))
 
 
 class GltfBuffer(_Object):
@@ -103,23 +108,17 @@ class GltfTextureTransform(_Object):
     texCoord: Index | None = None
 
 
-class GltfTextureExtensions(_Object):
-    """Extensions of a reference to a texture."""
-
-    transform: GltfTextureTransform = Field(GltfTextureTransform(), alias="KHR_texture_transform")
-
-
 class GltfTextureInfo(_Object):
     """A reference to a texture, and the texture coordinates that place it."""
 
     index: Index
     texCoord: Index = 0
-    extensions: GltfTextureExtensions = GltfTextureExtensions()
+    transform: GltfTextureTransform = _extension("KHR_texture_transform", GltfTextureTransform())
 
     @property
     def uv_set(self) -> int:
         """Number of the texture coordinates."""
-        own = self.extensions.transform.texCoord
+        own = self.transform.texCoord
         return self.texCoord if own is None else own
 
 
@@ -167,16 +166,6 @@ class GltfIor(_Object):
     ior: NotNegative = 1.5
 
 
-class GltfMaterialExtensions(_Object):
-    """Extensions of a material that are read."""
-
-    clearcoat: GltfClearcoat = Field(GltfClearcoat(), alias="KHR_materials_clearcoat")
-    sheen: GltfSheen = Field(GltfSheen(), alias="KHR_materials_sheen")
-    specular: GltfSpecular = Field(GltfSpecular(), alias="KHR_materials_specular")
-    ior: GltfIor = Field(GltfIor(), alias="KHR_materials_ior")
-    specular_glossiness: Any = Field(None, alias="KHR_materials_pbrSpecularGlossiness")
-
-
 class GltfMaterial(_Object):
     """What a surface reflects."""
 
@@ -187,7 +176,11 @@ class GltfMaterial(_Object):
     emissiveFactor: tuple[NotNegative, NotNegative, NotNegative] = (0.0, 0.0, 0.0)
     alphaMode: Literal["OPAQUE", "MASK", "BLEND"] = "OPAQUE"
     alphaCutoff: NotNegative = 0.5
-    extensions: GltfMaterialExtensions = GltfMaterialExtensions()
+    clearcoat: GltfClearcoat = _extension("KHR_materials_clearcoat", GltfClearcoat())
+    sheen: GltfSheen = _extension("KHR_materials_sheen", GltfSheen())
+    specular: GltfSpecular = _extension("KHR_materials_specular", GltfSpecular())
+    ior: GltfIor = _extension("KHR_materials_ior", GltfIor())
+    specular_glossiness: Any = _extension("KHR_materials_pbrSpecularGlossiness", None)
 
 
 class GltfPrimitive(_Object):
@@ -214,12 +207,6 @@ class GltfInstancing(_Object):
     attributes: dict[str, Index]
 
 
-class GltfNodeExtensions(_Object):
-    """Extensions of a node that are read."""
-
-    instancing: GltfInstancing | None = Field(None, alias="EXT_mesh_gpu_instancing")
-
-
 class GltfNode(_Object):
     """A place in the scene."""
 
@@ -232,7 +219,7 @@ class GltfNode(_Object):
     mesh: Index | None = None
     skin: Index | None = None
     weights: list[Number] = []
-    extensions: GltfNodeExtensions = GltfNodeExtensions()
+    instancing: GltfInstancing | None = _extension("EXT_mesh_gpu_instancing", None)
 
 
 class GltfScene(_Object):

@@ -33,15 +33,8 @@ def parse(text: bytes, kind: type) -> NDArray[Any] | None:
 
 
 def words_per_line(text: bytes) -> NDArray[np.int64]:
-    """Number of words of each line; all lines end with a line break."""
-    ends = np.flatnonzero(_codes(text) == ord("\n"))
-    return np.diff(np.searchsorted(_word_starts(text), ends), prepend=0)
-
-
-def slashes_per_word(text: bytes) -> NDArray[np.int64]:
-    """Number of slashes in each word."""
-    slashes = np.flatnonzero(_codes(text) == ord("/"))
-    return np.diff(np.searchsorted(slashes, _word_starts(text)), append=len(slashes))
+    """Number of words of each line."""
+    return np.array([len(line.split()) for line in text.splitlines()], np.int64)
 
 
 def read_bytes(path: Path) -> bytes:
@@ -56,15 +49,3 @@ def read_bytes(path: Path) -> bytes:
     if not data:
         raise InputError("is empty", where=path)
     return data
-
-
-def _codes(text: bytes) -> NDArray[np.uint8]:
-    return np.frombuffer(text, np.uint8)
-
-
-def _word_starts(text: bytes) -> NDArray[np.int64]:
-    """Places of the first characters of all words."""
-    blank = _codes(text) <= ord(" ")
-    starts = ~blank
-    starts[1:] &= blank[:-1]
-    return np.flatnonzero(starts)

@@ -15,11 +15,13 @@ from mbtf_core.errors import InputError
 from mbtf_core.meshes.companions import Companions
 from mbtf_core.meshes.content import F64, MeshContent, MeshShape, groups_of, with_colors
 from mbtf_core.meshes.mtl import MtlMaterial, as_text, material_values, read_mtl
-from mbtf_core.meshes.numbers import parse, read_bytes, slashes_per_word, words_per_line
+from mbtf_core.meshes.numbers import parse, read_bytes, words_per_line
 from mbtf_core.meshes.polygons import UNCUT, triangulate
 from mbtf_core.paths import suggest_name
 
 I64 = NDArray[np.int64]
+# Numbers of a vertex: its position and its color.
+_MOST = 6
 # Elements that are no polygons.
 _OTHERS = {b"l": "lines", b"p": "points", b"curv": "curves", b"curv2": "curves", b"surf": "curved surfaces"}
 
@@ -123,26 +125,24 @@ class _Lines:
         self.warnings = [f"its {', '.join(sorted(others))} are not used"] if others else []
 
     def positions(self) -> tuple[F64, F64 | None]:
-        """Vertices (n, 3) and their linear colors, NaN where some have none."""
-        numbers, counts = self._table(b"v")
+        """Vertices (n, 3) and their linear colors, white where some have none."""
+        table, counts = self._table(b"v")
         bad = ~np.isin(counts, (3, 4, 6))
         if bad.any():
             raise self._fault(b"v", bad, "a vertex has x, y, z and may have w, or r, g and b")
-        positions, colored = _columns(numbers, counts, range(3)), counts == 6
+        positions, colored = table[:, :3], counts == 6
         if not colored.any():
             return positions, None
-        colors = np.where(colored[:, None], _columns(numbers, counts, range(3, 6)), np.nan)
         if not colored.all():
             self.warnings.append(
                 f"{np.count_nonzero(~colored):,} of its vertices have no color: they are white"
             )
-            colors[~colored] = 1.0
+        colors = np.where(colored[:, None], table[:, 3:], 1.0)
         return positions, np.asarray(srgb_to_linear(colors), np.float64)
 
     def vectors(self, keyword: bytes, count: int) -> F64:
         """Texture coordinates or normals (n, count); those that are left out are 0."""
-        numbers, counts = self._table(keyword)
-        return _columns(numbers, counts, range(count))
+        return self._table(keyword)[0][:, :count]
 
     def corners(self, vectors: tuple[F64, F64, F64]) -> tuple[I64, I64, I64]:
         """Numbers (c, 3) of the vertex, of the texture coordinates and of the normal at all corners of
@@ -176,13 +176,19 @@ class _Lines:
         return indices, sizes, run
 
     def _table(self, keyword: bytes) -> tuple[F64, I64]:
-        """All numbers of the statements of a keyword, and how many each has."""
+        """Numbers (n, 6) of the statements of a keyword, 0 for those that are left out, and how many each
+        has."""
         text = _joined(self.rows[keyword])
-        numbers = parse(text, np.float64)
-        if numbers is None:
-            bad = np.array([parse(_joined([row]), np.float64) is None for row in self.rows[keyword]])
+        numbers, counts = parse(text, np.float64), words_per_line(text)
+        if numbers is None or len(numbers) != counts.sum():
+            rows = [parse(_joined([row]), np.float64) for row in self.rows[keyword]]
+            bad = np.array([found is None or len(found) != n for found, n in zip(rows, counts, strict=True)])
             raise self._fault(keyword, bad, "it has words that are no numbers")
-        return numbers, words_per_line(text)
+        if (counts > _MOST).any():
+            raise self._fault(keyword, counts > _MOST, f"it has more than {_MOST} numbers")
+        table = np.zeros((len(counts), _MOST))
+        table[np.arange(_MOST) < counts[:, None]] = numbers
+        return table, counts
 
     def _fault(self, keyword: bytes, bad: NDArray[np.bool_], what: str) -> InputError:
         """The error of the first bad statement of a keyword."""
@@ -260,25 +266,15 @@ def _joined(rows: list[bytes]) -> bytes:
     return re.sub(rb"#[^\n]*", b"", text) if b"#" in text else text
 
 
-def _columns(numbers: F64, counts: I64, columns: range) -> F64:
-    """Some columns (n, k) of a table whose rows have `counts` numbers; 0 where a row is shorter."""
-    start = np.cumsum(counts) - counts
-    out = np.zeros((len(counts), len(columns)))
-    for k, column in enumerate(columns):
-        there = counts > column
-        out[there, k] = numbers[start[there] + column]
-    return out
-
-
 def _indices(text: bytes, count: int | None) -> I64 | None:
     """Numbers (count, 3) of corners ``v``, ``v/vt``, ``v//vn`` or ``v/vt/vn``, 0 for what is left out; None
     where they have another form."""
     text = text.replace(b"//", b"/0/")
     if count:
-        slashes = slashes_per_word(text)
-        width = int(slashes[0]) + 1
-        numbers = parse(text.replace(b"/", b" "), np.int64) if (slashes == width - 1).all() else None
-        if numbers is not None and width <= 3 and len(numbers) == count * width:
+        widths = {word.count(b"/") + 1 for word in text.split()}
+        width = max(widths)
+        numbers = parse(text.replace(b"/", b" "), np.int64) if len(widths) == 1 and width <= 3 else None
+        if numbers is not None and len(numbers) == count * width:
             out = np.zeros((count, 3), np.int64)
             out[:, :width] = numbers.reshape(count, width)
             return out

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.data.documents import sidecar
+from mbtf_core.data.documents import Quarantined, Sidecar, Statistics
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import ShardEntry
 from mbtf_core.data.shard_files import Arrays, write_shard
@@ -59,30 +59,30 @@ def store_shard(
     if len(halves) == 2:
         difference = (halves[0] - halves[1]).astype(np.float64)
         variance = (0.25 * np.square(difference).mean(axis=0)).tolist()
-    target = None if estimates is None else estimates.target
-    quarantined = {
-        "nonfinite_samples": 0 if estimates is None else estimates.nonfinite,
-        "lost_rays": 0 if estimates is None else estimates.lost,
-        "capped_rays": 0 if estimates is None else estimates.capped,
-        "nonfinite_at": [] if estimates is None else [asdict(bad) for bad in estimates.bad_samples],
-    }
+    quarantined = Quarantined()
+    if estimates is not None:
+        quarantined = Quarantined(
+            nonfinite_samples=estimates.nonfinite,
+            lost_rays=estimates.lost,
+            capped_rays=estimates.capped,
+            nonfinite_at=list(estimates.bad_samples),
+        )
 
     def record(stored: Stored) -> dict[str, Any]:
-        return sidecar(
-            entry,
-            stored,
+        return Sidecar(
             config_hash=config_hash,
             plan=plan,
-            seed=seed,
+            **asdict(entry),
+            **asdict(stored),
+            seed={"root": seed, "split": entry.split, "shard": entry.index},
             spp=spp,
             queries=len(halves[0]),
             paths=0 if estimates is None else estimates.paths,
             seconds=round(seconds, 4),
             quarantined=quarantined,
-            target=None if target is None else asdict(target),
-            mean_value=mean.tolist(),
-            mean_variance=variance,
-        )
+            target=None if estimates is None else estimates.target,
+            statistics=Statistics(mean_value=mean.tolist(), mean_variance=variance),
+        ).as_dict()
 
     return folder.write_shard(entry.file, lambda path: write_shard(path, arrays), record)
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -131,20 +130,6 @@ class FiberTile(Tile):
     def _distinct(self) -> list[FiberScattering]:
         """The scattering of each part of the surface."""
         return list(dict.fromkeys(self.scattering))
-
-    def mitsuba_shapes(self, unit: float, folder: Path, bsdf: Mapping[str, Any]) -> dict[str, Any]:
-        """One shape per color: Mitsuba's own texture coordinates run around the fiber."""
-        out: dict[str, Any] = {}
-        for color in np.unique(self.yarn):
-            file = folder / f"color_{color}.txt"
-            with file.open("w") as text:
-                for number in np.flatnonzero(self.yarn == color):
-                    points = self.curves[int(number)].unrolled() - (0.5, 0.5 * self.aspect, 0.0, 0.0)
-                    np.savetxt(text, points * unit, fmt="%.9g")
-                    text.write("\n")
-            own = replace(self, colors=self.colors[[color]], scattering=(self.scattering[color],)).surface()
-            out[f"color_{color}"] = {"type": "bsplinecurve", "filename": str(file), "bsdf": own}
-        return out
 
     def surface(
         self, on: Collection[str] = REFLECTION, slopes: NDArray[np.float64] | None = None

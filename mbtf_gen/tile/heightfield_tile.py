@@ -6,7 +6,6 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -22,7 +21,6 @@ from mbtf_gen.tile.heights import (
     residual_slopes,
     rms_slope,
     slope_angles,
-    tile_mesh,
 )
 from mbtf_gen.tile.inspection import ALBEDO_RANGE, inspection_text, oddities
 from mbtf_gen.tile.maps.checks import Codes, far_off, suggestion_warning
@@ -180,15 +178,6 @@ class HeightFieldTile(Tile):
 
     def trace(self, unit: float, below: bool = False) -> TileGeometry:
         return self.grid.trace(unit, below)
-
-    def mitsuba_shapes(self, unit: float, folder: Path, bsdf: Mapping[str, Any]) -> dict[str, Any]:
-        mesh = tile_mesh(self.grid)
-        mesh.apply_translation([-0.5, -0.5 * self.aspect, 0.0])
-        mesh.apply_scale(unit)
-        file = folder / "tile.ply"
-        file.write_bytes(mesh.export(file_type="ply", vertex_normal=False))
-        flat = {"face_normals": True, "flip_tex_coords": True}
-        return {"tile": {"type": "ply", "filename": str(file), **flat, "bsdf": dict(bsdf)}}
 
     def lattice(self, finest: int | None = None) -> Lattice:
         """Texel grids of the levels up to `finest`; by default up to the material's own resolution, else to

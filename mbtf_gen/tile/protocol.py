@@ -101,22 +101,6 @@ class Tile(ABC):
             Whether rays may be below the surface, as behind an opacity mask.
         """
 
-    def mitsuba_shapes(self, unit: float, folder: Path, bsdf: Mapping[str, Any]) -> dict[str, Any]:
-        """Shapes of one period for unmodified Mitsuba, centered.
-
-        Parameters
-        ----------
-        unit : scene units per tile width
-        folder : where files of shapes are written
-        bsdf : reflectance, of tiles that have no other
-
-        Raises
-        ------
-        UsageError
-            Mitsuba's own shapes do not have this kind of tile.
-        """
-        raise UsageError("unmodified Mitsuba has no shapes of this kind of tile")
-
     def lattice(self, finest: int | None = None) -> Lattice:
         """Texel grids of the levels up to `finest`; by default up to the material's own resolution."""
         return Lattice((self.resolution or 1).bit_length() - 1 if finest is None else finest, self.aspect)

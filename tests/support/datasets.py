@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.documents import sidecar
+from mbtf_core.data.documents import Quarantined, Sidecar, Statistics
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import (
@@ -20,8 +21,6 @@ from mbtf_core.data.schema import (
     MANIFEST_NAME,
     SCHEMA_VERSION,
     Queries,
-    ShardEntry,
-    Split,
 )
 from mbtf_core.data.shard_files import read_shard, write_shard
 from mbtf_core.files.atomic import Stored, checksummed, file_sha256, parse_checksummed
@@ -88,21 +87,24 @@ def write_sidecar(shard: Path, split: str, index: int, config_hash: str, **chang
     arrays = read_shard(shard)
     halves = [arrays[name].reshape(-1, 3) for name in ("value_a", "value_b") if name in arrays]
     mean = sum(a.mean(axis=0, dtype=np.float64) if len(a) else np.zeros(3) for a in halves) / len(halves)
-    record = sidecar(
-        ShardEntry(cast(Split, split), index, shard.name, len(arrays["sigma"])),
-        Stored(shard.stat().st_size, file_sha256(shard)),
+    stored = Stored(shard.stat().st_size, file_sha256(shard))
+    record = Sidecar(
         config_hash=config_hash,
         plan="",
-        seed=0,
+        file=shard.name,
+        split=split,
+        index=index,
+        rows=len(arrays["sigma"]),
+        **asdict(stored),
+        seed={"root": 0, "split": split, "shard": index},
         spp=2,
         queries=arrays["sigma"].size,
         paths=0,
         seconds=0.0,
-        quarantined={"nonfinite_samples": 0, "nonfinite_at": [], "lost_rays": 0, "capped_rays": 0},
+        quarantined=Quarantined(),
         target=None,
-        mean_value=np.nan_to_num(mean).tolist(),
-        mean_variance=None,
-    )
+        statistics=Statistics(mean_value=np.nan_to_num(mean).tolist(), mean_variance=None),
+    ).as_dict()
     shard.with_suffix(".json").write_bytes(checksummed({**record, **changes}))
 
 

@@ -25,6 +25,7 @@ from mbtf_gen.config.generator import GeneratorConfig, LightSection
 from mbtf_gen.job import Job
 from mbtf_gen.tile.maps.material_file import ROLES
 from mbtf_gen.tile.protocol import Tile
+from support.mitsuba_shapes import mitsuba_shapes
 
 F64 = NDArray[np.float64]
 Halves = tuple[F64, F64]
@@ -109,7 +110,7 @@ def _mitsuba_scene(job: Job, camera: Camera, omega_i: F64, folder: Path) -> dict
 
     aspect = job.material.aspect
     unit = LONG_SIDE / max(1.0, aspect)
-    tile = job.material.mitsuba_shapes(unit, folder, _mitsuba_bsdf(job))
+    tile = mitsuba_shapes(job.material, unit, folder, _mitsuba_bsdf(job))
     # Surfaces within this distance affect a pixel at the edge by visibility, shadowing or interreflection.
     slope = math.tan(math.radians(LOWEST_LIGHT))
     reach = 0.75 * camera.tiles_across + 2.0 * job.material.thickness / slope + 1.0

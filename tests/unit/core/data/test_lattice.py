@@ -1,4 +1,4 @@
-"""Levels of detail: texels, footprints, blending weights."""
+"""Levels of detail: texels and footprints."""
 
 from __future__ import annotations
 
@@ -37,18 +37,6 @@ def test_default_lattice_of_a_map(rows: int, columns: int, finest: int, shape: t
     assert lattice.shape() == shape
     assert lattice.texels() == shape[0] * shape[1]
     assert lattice.shape(0) == (max(1, round(rows / columns)), 1)
-
-
-@given(st.integers(0, 14), st.floats(-3, 18))
-def test_blending(finest: int, level: float) -> None:
-    """Weights of the two levels reproduce the level, clamped to the data's range."""
-    coarse, fine, weight = Lattice(finest).blend(sigma_of_level([level]))
-    clamped = min(max(level, 0.0), float(finest))
-    assert 0 <= coarse[0] <= fine[0] <= finest
-    assert 0.0 <= weight[0] <= 1.0
-    assert coarse[0] * (1 - weight[0]) + (coarse[0] + 1) * weight[0] == pytest.approx(clamped, abs=1e-9)
-    if finest > 0:
-        assert fine[0] == coarse[0] + 1
 
 
 def test_texel_centers() -> None:

@@ -77,6 +77,8 @@ def test_all_forms_of_faces(tmp_path: Path, faces: str) -> None:
         ("f 1 2 x", "numbers"),
         ("f 1 2", "no triangles"),
         ("v 1 2\nf 1 2 3", "x, y, z"),
+        ("v 1 2-3\nf 1 2 3", "numbers"),
+        ("vt 1 2 3 4 5 6 7\nf 1 2 3", "numbers"),
         ("f 1 2 99999999999999999999999", "lacks"),
         ("\0", "text"),
     ],
