@@ -44,6 +44,8 @@ LONG_RUN = 30_000_000
 LONG_FIBER_RUN = 1_000_000
 # Data of fewer paths per query take little less time.
 FEWEST_SPP = 4
+# Relative error of a predicted noise from which it is stated; a pilot without highlights has a tenth of it.
+_UNCERTAIN = 0.02
 # Time from which a shorter command is named.
 _LONG_SECONDS = 120.0
 
@@ -79,11 +81,14 @@ class Forecast:
         """One line, two under a target error."""
         total = self.start + self.seconds
         error = f" ± {clock(self.seconds_se)}" if self.seconds_se >= 0.5 else ""
+        noise = f"{self.relative_error:.0%} of the mean value"
+        # Most of the variance of highlights is that of few queries, which a pilot may miss.
+        if self.relative_error_se > _UNCERTAIN * self.relative_error:
+            noise += f", ± {self.relative_error_se:.0%} or more: few queries decide it"
         line = (
             f"forecast: {clock(total)}{error}, "
             f"{rate_text(self.paths / max(total, 1e-9))} ({self.start:.0f} s of startup included), "
-            f"{size_text(self.bytes)}, noise of one training value {self.relative_error:.0%} of the mean "
-            "value"
+            f"{size_text(self.bytes)}, noise of one training value {noise}"
         )
         if target is None:
             return line
