@@ -184,7 +184,6 @@ def _read(path: Path) -> Described:
         cloth = build(ClothFile, document, source=str(path))
         try:
             if cloth.weave is not None:
-                # Faults of the weave are at a line of this file.
                 _ = cloth.woven
         except InputError as fault:
             line = line_of(document, [str(fault.where)])
