@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mbtf_core.app.console import Console
 from mbtf_core.data.schema import ShardEntry
@@ -147,7 +146,10 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
     total = path.scaled(count * per_query + test_paths / path_work(lights))
     mean = 0.5 * float(np.mean(a, dtype=np.float64) + np.mean(b, dtype=np.float64))
     # Queries of a group are one unit: their errors are correlated.
-    by_group = (np.concatenate([_by_group(getattr(one, name), lights) for one in found]) for name in _HALVES)
+    by_group = (
+        np.concatenate([getattr(one, name).reshape(lights, -1, 3).swapaxes(0, 1) for one in found])
+        for name in _HALVES
+    )
     error = pooled_error(*by_group).scaled(1.0 / mean if mean > 0 else 0.0)
     return Forecast(
         seconds=total.value,
@@ -160,11 +162,6 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
         relative_error=error.value,
         relative_error_se=error.error,
     )
-
-
-def _by_group(values: NDArray[np.float32], lights: int) -> NDArray[np.float32]:
-    """Values (n, 3) of queries as (groups, lights, 3)."""
-    return values.reshape(lights, -1, 3).swapaxes(0, 1)
 
 
 def announce(
