@@ -18,19 +18,24 @@ ELEVATION_BANDS: tuple[float, ...] = (0.0, 0.2, 0.4, 0.7, 1.0)
 _ROUNDING = 1e-3
 
 
-def check_unit(omega: ArrayLike, name: str) -> None:
-    """Refuse directions (..., 3) that are not unit vectors.
+def check_unit(omega: ArrayLike, name: str, *, above: bool = False) -> None:
+    """Refuse directions (..., 3) that are not unit vectors, or, with `above`, have no z > 0.
 
     Raises
     ------
-    InputError : with the number of such directions, and the first length
+    InputError : with the number of such directions, and the first length or z
     """
-    length = np.linalg.norm(np.asarray(omega, np.float64), axis=-1).reshape(-1)
-    bad = np.flatnonzero(~(np.abs(length - 1.0) <= _ROUNDING))
-    if len(bad):
-        what = f"{len(bad)} of {len(length)} directions are not unit vectors; "
-        what += f"the first, at index {bad[0]}, has the length {length[bad[0]]:.4g}"
-        raise InputError(what, where=name, hint="normalize them: mbtf_core.directions.normalize")
+    found = np.asarray(omega, np.float64).reshape(-1, 3)
+    length, z = np.linalg.norm(found, axis=-1), found[:, 2].astype(np.float32)
+    normalize = "normalize them: mbtf_core.directions.normalize"
+    for good, expected, what, values, hint in (
+        (np.abs(length - 1.0) <= _ROUNDING, "unit vectors", "the length", length, normalize),
+        ((z > 0) | (not above), "above the plane", "z =", z, "leave them out: they have no values"),
+    ):
+        if not good.all():
+            at = int(good.argmin())
+            text = f"{np.sum(~good)} of {len(good)} directions are not {expected}; the first, at index {at}, "
+            raise InputError(f"{text}has {what} {values[at]:.4g}", where=name, hint=hint)
 
 
 def from_projected_disk(xy: ArrayLike) -> NDArray[np.float64]:

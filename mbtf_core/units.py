@@ -17,7 +17,7 @@ _BYTES = {"TB": 1e12, "GB": 1e9, "MB": 1e6, "kB": 1e3, "KB": 1e3, "B": 1.0}
 
 
 def _parse(text: str | float, units: Mapping[str, float], expected: str) -> float:
-    match = re.fullmatch(rf"\s*(\d+(?:\.\d+)?(?:e\d+)?)\s*({'|'.join(units)})?\s*", str(text))
+    match = re.fullmatch(rf"\s*(-?\d+(?:\.\d+)?(?:e\d+)?)\s*({'|'.join(units)})?\s*", str(text))
     if match is None:
         raise ValueError(f"must be {expected}")
     return float(match[1]) * units.get(match[2], 1.0)

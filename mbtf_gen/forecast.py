@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mbtf_core.app.console import Console
 from mbtf_core.data.schema import ShardEntry
@@ -44,6 +43,8 @@ LONG_RUN = 30_000_000
 LONG_FIBER_RUN = 1_000_000
 # Data of fewer paths per query take little less time.
 FEWEST_SPP = 4
+# Relative error of a predicted noise from which it is stated; a pilot without highlights has a tenth of it.
+_UNCERTAIN = 0.02
 # Time from which a shorter command is named.
 _LONG_SECONDS = 120.0
 
@@ -79,11 +80,14 @@ class Forecast:
         """One line, two under a target error."""
         total = self.start + self.seconds
         error = f" ± {clock(self.seconds_se)}" if self.seconds_se >= 0.5 else ""
+        noise = f"{self.relative_error:.0%} of the mean value"
+        # Most of the variance of highlights is that of few queries, which a pilot may miss.
+        if self.relative_error_se > _UNCERTAIN * self.relative_error:
+            noise += f", ± {self.relative_error_se:.0%} or more: few queries decide it"
         line = (
             f"forecast: {clock(total)}{error}, "
             f"{rate_text(self.paths / max(total, 1e-9))} ({self.start:.0f} s of startup included), "
-            f"{size_text(self.bytes)}, noise of one training value {self.relative_error:.0%} of the mean "
-            "value"
+            f"{size_text(self.bytes)}, noise of one training value {noise}"
         )
         if target is None:
             return line
@@ -142,7 +146,10 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
     total = path.scaled(count * per_query + test_paths / path_work(lights))
     mean = 0.5 * float(np.mean(a, dtype=np.float64) + np.mean(b, dtype=np.float64))
     # Queries of a group are one unit: their errors are correlated.
-    by_group = (np.concatenate([_by_group(getattr(one, name), lights) for one in found]) for name in _HALVES)
+    by_group = (
+        np.concatenate([getattr(one, name).reshape(lights, -1, 3).swapaxes(0, 1) for one in found])
+        for name in _HALVES
+    )
     error = pooled_error(*by_group).scaled(1.0 / mean if mean > 0 else 0.0)
     return Forecast(
         seconds=total.value,
@@ -155,11 +162,6 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
         relative_error=error.value,
         relative_error_se=error.error,
     )
-
-
-def _by_group(values: NDArray[np.float32], lights: int) -> NDArray[np.float32]:
-    """Values (n, 3) of queries as (groups, lights, 3)."""
-    return values.reshape(lights, -1, 3).swapaxes(0, 1)
 
 
 def announce(

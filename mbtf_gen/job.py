@@ -98,8 +98,11 @@ class Job:
             log.info(text)
 
     def announce_briefly(self) -> None:
-        """Log how many warnings there are about the material, for commands that make no data."""
-        if count := len(self.material.warnings_in_use()):
+        """Log the warning about the height scale, and how many others there are, for commands that make no
+        data."""
+        if (scale := self.material.scale_warning()) is not None:
+            log.warning(scale)
+        if count := len(self.material.warnings_in_use()) - (scale is not None):
             warnings = f"{count} warnings" if count > 1 else "1 warning"
             log.info(f"{warnings} about this material: mbtf-gen inspect {shlex.quote(self.config.material)}")
 

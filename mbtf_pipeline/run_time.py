@@ -85,17 +85,15 @@ class RunForecaster:
     """Forecasts runs of one material; a pilot measures the material and the generator of a recipe."""
 
     def __init__(self, recipe: Recipe) -> None:
-        self.recipe = recipe
-        self.material = Job.load(recipe.generate).material
+        self.job = Job.load(recipe.generate)
 
     @cached_property
     def speed(self) -> tuple[float, float]:
         """Seconds of starting the generator, and of a path."""
         from mbtf_gen.forecast import forecast
 
-        job = Job.of(self.recipe.generate, self.material)
-        found = forecast(job, seconds=1.0)
-        return found.start, found.query_seconds / query_work(job)
+        found = forecast(self.job, seconds=1.0)
+        return found.start, found.query_seconds / query_work(self.job)
 
     def of(
         self,
@@ -112,7 +110,7 @@ class RunForecaster:
         start, path = self.speed if speed is None else speed
         paths, size, queries = 0.0, 0, 0
         for data in data_sets(recipe):
-            job = Job.of(data.config, self.material)
+            job = Job.of(data.config, self.job.material)
             queries = split_queries(job, "train")
             if stages is None or data.stage in stages:
                 paths += planned_work(job, job.shards)

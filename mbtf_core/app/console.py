@@ -26,6 +26,7 @@ import difflib
 import json as json_module
 import logging
 import os
+import re
 import sys
 import traceback
 import warnings
@@ -238,6 +239,16 @@ def _check_tokens(tokens: Sequence[str]) -> None:
             raise UsageError("is not UTF-8 text", where=token, hint="rename the file or folder")
 
 
+def _with_negative_values(tokens: Sequence[str]) -> list[str]:
+    """Tokens with ``--flag -5s`` as ``--flag=-5s``: cyclopts takes ``-5s`` for an option."""
+    joined: list[str] = []
+    for token in tokens:
+        if re.match(r"-\.?\d", token) and joined and re.fullmatch(r"--[a-z][a-z-]*", joined[-1]):
+            token = f"{joined.pop()}={token}"
+        joined.append(token)
+    return joined
+
+
 def run(app: App, argv: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit code; no exception leaves except SystemExit.
 
@@ -266,7 +277,7 @@ def run(app: App, argv: Sequence[str] | None = None) -> int:
     try:
         with signals.raising(), _library_warnings(debug):
             _check_tokens(tokens)
-            result = app(tokens)
+            result = app(_with_negative_values(tokens))
         # None where it was closed before the start.
         if sys.stdout is not None:
             sys.stdout.flush()

@@ -199,7 +199,7 @@ class Material:
         sigma : (...) float array
             Standard deviations of the footprints in tile widths, clamped to the material's levels.
         omega_i, omega_o : (..., 3) float array
-            Unit vectors towards light and viewer, z > 0. Below the plane, values mean nothing.
+            Unit vectors towards light and viewer, z > 0.
 
         Returns
         -------
@@ -208,13 +208,13 @@ class Material:
         Raises
         ------
         InputError
-            Not finite numbers, a direction is not a unit vector, or the shapes do not broadcast.
+            Not finite numbers, a direction is no unit vector with z > 0, or the shapes do not broadcast.
         """
         lead, flat = _broadcast(
             {"u": (u, 2), "sigma": (sigma, 0), "omega_i": (omega_i, 3), "omega_o": (omega_o, 3)}
         )
-        check_unit(omega_i, "omega_i")
-        check_unit(omega_o, "omega_o")
+        check_unit(omega_i, "omega_i", above=True)
+        check_unit(omega_o, "omega_o", above=True)
         return predict(self.model, *flat).reshape(*lead, 3)
 
     def offset(self, u: ArrayLike, omega_o: ArrayLike) -> NDArray[np.float32]:
@@ -236,11 +236,11 @@ class Material:
         Raises
         ------
         InputError
-            Not finite numbers, a direction is not a unit vector, or the shapes do not broadcast.
+            Not finite numbers, a direction is no unit vector with z > 0, or the shapes do not broadcast.
         """
         device = next(self.model.parameters()).device
         lead, flat = _broadcast({"u": (u, 2), "omega_o": (omega_o, 3)})
-        check_unit(omega_o, "omega_o")
+        check_unit(omega_o, "omega_o", above=True)
         return evaluate_in_chunks(self.model.offset, device, 2, *flat).reshape(*lead, 2)
 
     def predict(self, queries: ShardQueries) -> NDArray[np.float32]:

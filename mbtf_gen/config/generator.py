@@ -23,8 +23,8 @@ from mbtf_gen.sampling.light_kernel import MAX_WIDTH_DEG, MIN_WIDTH_DEG
 
 # Largest height scale.
 MAX_SCALE = 100
-_PERCENT = re.compile(r"^\s*(\d+(?:\.\d*)?|\.\d+)\s*%\s*$")
-_COUNT = re.compile(r"^\s*(\d+(?:\.\d+)?(?:[eE][+]?\d+)?)\s*(/\s*texel)?\s*$")
+_PERCENT = re.compile(r"^\s*(-?(?:\d+(?:\.\d*)?|\.\d+))\s*%\s*$")
+_COUNT = re.compile(r"^\s*(-?\d+(?:\.\d+)?(?:[eE][+]?\d+)?)\s*(/\s*texel)?\s*$")
 
 
 def parse_count(text: str | int | float) -> tuple[float, bool]:

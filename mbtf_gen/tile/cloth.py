@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256
-from mbtf_core.paths import named_file, suggest_name
+from mbtf_core.paths import named_file
 from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile
 from mbtf_gen.tile.fibers.cloth_file import ClothFile, YarnEntry
 from mbtf_gen.tile.fibers.curve_file import read_curves
 from mbtf_gen.tile.fibers.curves import LONGEST_SEGMENT, THINNEST, Bundle, Curve
-from mbtf_gen.tile.fibers.draft import Weave, colors_of, parse_draft, parse_sequence
+from mbtf_gen.tile.fibers.draft import Weave
 from mbtf_gen.tile.fibers.weave import knitted_lines, read_pattern, woven_lines
 from mbtf_gen.tile.fibers.yarn import YARNS, CrossSection, YarnModel, count_segments, fibers_of, roughness_of
 
@@ -83,7 +83,7 @@ def _fibers(spec: ClothFile, folder: Path) -> FiberTile:
     elif spec.knit is not None:
         aspect, yarns = _knitted(spec)
     else:
-        woven = woven_tile(spec)
+        woven = spec.woven
         aspect, yarns = _woven(spec, woven)
     _check_aspect(aspect, where)
     kinds = _kinds(spec)
@@ -106,39 +106,6 @@ def _fibers(spec: ClothFile, folder: Path) -> FiberTile:
 
 # Center line, cross-section, and name of its kind.
 _Yarn = tuple[Curve, CrossSection, str]
-
-
-def woven_tile(spec: ClothFile) -> Weave:
-    """One tile of a woven cloth; an InputError at a key of it that is invalid or names an unused yarn."""
-    text, names = spec.weave or "", list(spec.yarns)
-    draft, blocks = parse_draft(text), colors_of(text)
-    if spec.warp is not None:
-        warp = parse_sequence(spec.warp, "warp")
-        weft = warp if spec.weft is None else parse_sequence(spec.weft, "weft")
-    elif blocks is not None:
-        if len(names) != 2:
-            raise InputError(
-                f"{text.strip()} needs two yarns, or 'warp' and 'weft'",
-                where="yarns",
-                hint="such as yarns: {dark: '#20242f', light: '#e8e2d4'}",
-            )
-        (a, b), (ends, picks) = names, blocks
-        warp, weft = [a] * ends + [b] * ends or [a], [a] * picks + [b] * picks or [b]
-    elif names:
-        raise InputError(
-            "are given, but not their sequence", where="yarns", hint=f"such as warp: {names[0]}4"
-        )
-    else:
-        warp = weft = ["yarn"]
-    known = names or ["yarn"]
-    for key, sequence in (("warp", warp), ("weft", weft)):
-        if unknown := next((name for name in sequence if name not in known), None):
-            what = f"names the yarn '{unknown}', which 'yarns' does not have"
-            hint = suggest_name(unknown, known) or f"it has {', '.join(names) or 'none'}"
-            raise InputError(what, where=key, hint=hint)
-    if unused := next((name for name in known if name not in (*warp, *weft)), None):
-        raise InputError(f"'{unused}' is in neither warp nor weft", where="yarns")
-    return Weave.of(draft, warp, weft, spec.repeat)
 
 
 def _woven(spec: ClothFile, woven: Weave) -> tuple[float, list[_Yarn]]:

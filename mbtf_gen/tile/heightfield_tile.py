@@ -116,6 +116,11 @@ class HeightFieldTile(Tile):
         heights = resample(self.height, rows, columns, "cubic").astype(np.float64)
         return replace(HeightGrid.from_map(heights, self.height_scale, self.aspect), tracer=self.tracer)
 
+    @cached_property
+    def _median_slope(self) -> float:
+        """Degrees."""
+        return slope_angles(self._resampled)[0]
+
     def _fault(self, limit: float) -> tuple[str, str] | None:
         """(what, hint) why generation refuses the heights under a limit of their range, or None."""
         unit = None if math.isinf(limit) else self.unit_fault()
@@ -139,7 +144,7 @@ class HeightFieldTile(Tile):
         suggested = f"the normal map suggests --height-scale {fit.scale:.3g}" if fit else ""
         if facts.pixel_size is None and extent <= _NORMALIZED:
             agrees = fit is not None and not far_off(self.height_scale, fit.scale)
-            steep = 0.0 if agrees else slope_angles(self._resampled)[0]
+            steep = 0.0 if agrees else self._median_slope
             what = f"{what}: half of the surface would be steeper than {steep:.1f}°"
             hint = suggested or f"give one, such as --height-scale {_CUSTOMARY}"
             return (what, f"{hint}; 1 where heights are in tile widths") if steep > _CLIFFS else None
@@ -340,15 +345,14 @@ class HeightFieldTile(Tile):
         path, extent = self.files["height"], float(np.ptp(self.height))
         if extent == 0:
             return None
-        median = slope_angles(self._resampled)[0]
         if "normal" in self.files:
-            text = suggestion_warning(self.files["normal"], self.normal_fit, self.height_scale, median)
-            if text is not None:
+            used = self.height_scale, self._median_slope
+            if text := suggestion_warning(self.files["normal"], self.normal_fit, *used):
                 return text
         extent *= abs(self.height_scale)
         if self.height_from == "default" and extent > _STEEP and self.unit_fault() is None:
             return f"{path}: the displacement range is {extent:.4g} tile widths; check --height-scale"
-        if median > _CLIFFS:
+        if (median := self._median_slope) > _CLIFFS:
             return f"{path}: half of the surface is steeper than {median:.1f}°; check --height-scale"
         return None
 

@@ -18,7 +18,7 @@ from mbtf_core.images.read import SUFFIXES, is_image
 from mbtf_core.meshes.read import MESH_FILES
 from mbtf_core.paths import named_file, suggest_path
 from mbtf_gen.tile.assembly import assemble, retiled
-from mbtf_gen.tile.cloth import cloth_tile, woven_tile
+from mbtf_gen.tile.cloth import cloth_tile
 from mbtf_gen.tile.fibers.cloth_file import CLOTH_KEYS, CURVE_FILES, ClothFile
 from mbtf_gen.tile.maps.discovery import FoundMaps, find_maps, unpack
 from mbtf_gen.tile.maps.material_file import MaterialFile
@@ -184,7 +184,7 @@ def _read(path: Path) -> Described:
         cloth = build(ClothFile, document, source=str(path))
         try:
             if cloth.weave is not None:
-                woven_tile(cloth)
+                _ = cloth.woven
         except InputError as fault:
             line = line_of(document, [str(fault.where)])
             raise InputError(fault.what, where=f"{path}:{line}: {fault.where}", hint=fault.hint) from None

@@ -160,9 +160,11 @@ def _forecast(recipe: Recipe, folder: Path, console: Console) -> None:
     from mbtf_pipeline.cost.forecast import forecast_errors
     from mbtf_pipeline.run_time import RunForecaster
 
+    forecaster = RunForecaster(recipe)
+    forecaster.job.announce_briefly()
     errors = forecast_errors(recipe, folder, console.note)
     training = {name: found["forecast"]["seconds"] for name, found in errors.items() if found["source"]}
-    expected = RunForecaster(recipe).of(recipe, training=training)
+    expected = forecaster.of(recipe, training=training)
     lines = [expected.describe()]
     for name, found in errors.items():
         first, *more = found["text"].splitlines()

@@ -174,6 +174,13 @@ def test_an_option_is_refused_with_its_flag(command: str, flag: str, key: str, f
     refusal(line_of(command, "--set", f"{misspelt}=1"), misspelt, key.rpartition(".")[2])
 
 
+def test_negative_values_reach_their_option() -> None:
+    for flag, value in (("--queries", "-5/texel"), ("--target-error", "-2%"), ("--spp", "-4")):
+        for words in ([flag, value], [f"{flag}={value}"]):
+            refusal(line_of("mbtf-gen", *words), f"{flag}: ", "must be")
+    refusal(line_of("mbtf-fit", "--time", "-5s"), "--time: ", "must be a positive duration")
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_flag_is_refused_where_it_is_misspelt_or_has_no_value(command: str) -> None:
     _, _, app = COMMANDS[command]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -11,7 +12,10 @@ from pydantic import BeforeValidator, Field, model_validator
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.schema import Tiling
+from mbtf_core.errors import InputError
+from mbtf_core.paths import suggest_name
 from mbtf_gen.config.generator import Positive, Resolution, Rgb, no_tiling
+from mbtf_gen.tile.fibers.draft import Weave, colors_of, parse_draft, parse_sequence
 from mbtf_gen.tile.fibers.yarn import YarnName
 
 # Files that can be given in place of a material file, by suffix, with the key that names them there.
@@ -152,3 +156,36 @@ class ClothFile(Settings):
     def tiling(self, given: Tiling | None) -> Tiling:
         """Method for maps that do not tile, which these are not."""
         return no_tiling(given)
+
+    @cached_property
+    def woven(self) -> Weave:
+        """One tile of the weave; an InputError at a key that is invalid or names an unused yarn."""
+        text, names = self.weave or "", list(self.yarns)
+        draft, blocks = parse_draft(text), colors_of(text)
+        if self.warp is not None:
+            warp = parse_sequence(self.warp, "warp")
+            weft = warp if self.weft is None else parse_sequence(self.weft, "weft")
+        elif blocks is not None:
+            if len(names) != 2:
+                raise InputError(
+                    f"{text.strip()} needs two yarns, or 'warp' and 'weft'",
+                    where="yarns",
+                    hint="such as yarns: {dark: '#20242f', light: '#e8e2d4'}",
+                )
+            (a, b), (ends, picks) = names, blocks
+            warp, weft = [a] * ends + [b] * ends or [a], [a] * picks + [b] * picks or [b]
+        elif names:
+            raise InputError(
+                "are given, but not their sequence", where="yarns", hint=f"such as warp: {names[0]}4"
+            )
+        else:
+            warp = weft = ["yarn"]
+        known = names or ["yarn"]
+        for key, sequence in (("warp", warp), ("weft", weft)):
+            if unknown := next((name for name in sequence if name not in known), None):
+                what = f"names the yarn '{unknown}', which 'yarns' does not have"
+                hint = suggest_name(unknown, known) or f"it has {', '.join(names) or 'none'}"
+                raise InputError(what, where=key, hint=hint)
+        if unused := next((name for name in known if name not in (*warp, *weft)), None):
+            raise InputError(f"'{unused}' is in neither warp nor weft", where="yarns")
+        return Weave.of(draft, warp, weft, self.repeat)

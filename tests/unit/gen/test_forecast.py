@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -99,6 +100,9 @@ def test_seconds_and_noise(faked: None, layout: str) -> None:
     noise = 0.8 / math.sqrt(8) / 0.25
     assert abs(found.relative_error - noise) < 5 * found.relative_error_se
     assert found.relative_error_se < 0.02 * noise
+    assert "decide" not in found.describe()
+    rare = replace(found, relative_error=1.28, relative_error_se=0.17).describe()
+    assert "noise of one training value 128% of the mean value, ± 17% or more" in rare
 
 
 def test_lights_of_one_path_take_less_time_and_their_noise_is_no_new_knowledge(faked: None) -> None:

@@ -279,6 +279,7 @@ def test_evaluation_broadcasts_as_numpy_does(fitted: FitResult) -> None:
         ("u", np.zeros(3), "have the shapes"),
         ("omega_i", 1.0, "have the shapes"),
         ("omega_i", [0.0, 0.0, 5.0], "1 of 1 directions"),
+        ("omega_o", [0.6, 0.0, -0.8], "1 of 1 directions are not above the plane; the first, at index 0"),
         ("omega_o", [0.0, 1.0], "have the shapes"),
         ("omega_o", [0.0, 0.0, np.nan], "NaN or infinity"),
     ],
