@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from mbtf_core.data.dataset import Dataset
-    from mbtf_fit.data.queries import ShardQueries
     from mbtf_fit.pytorch.material import NeuralMaterial
 
 # Options that only some models have, by dotted key; :attr:`Model.takes` names those of a model.
@@ -49,7 +48,6 @@ class Preparation:
     ----------
     data : the data set
     queries : the training queries, on the device
-    sample : a random sample of them
     training : options
     unit : typical value of the data in 1/sr
     seed : of the fit
@@ -58,7 +56,6 @@ class Preparation:
 
     data: Dataset
     queries: Any
-    sample: ShardQueries
     training: TrainingSection
     unit: float
     seed: int

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.models.model import PYRAMID, SHARED, Model, Preparation
@@ -23,9 +23,6 @@ from mbtf_fit.models.neumip import color, encode_directions, encode_position, hi
 from mbtf_fit.ops import Displace, Gate, Network, Operation, Rotate, Shade, Trace, Transform
 from mbtf_fit.ops.constants import DIELECTRIC, HEIGHTS, HORIZONS, IRRADIANCE_SCALE, LIGHT_WIDTH, MAPS, PLACES
 from mbtf_fit.sections import NetworkSection
-
-if TYPE_CHECKING:
-    from mbtf_fit.data.queries import ShardQueries
 
 # Bytes of a training query in memory, and of its hints.
 QUERY_BYTES, HINT_BYTES = 48, 28
@@ -93,21 +90,7 @@ class Relief(Model):
         geometry = given.data.geometry()
         assert geometry is not None
         self.material.know(KnownSurface.of(geometry, given.data.lattice, given.light_width))
-        if any(isinstance(op, Gate) and op.plus for op in self.material.operations):
-            self._bound(given.sample, given.unit)
         return given.queries
-
-    def _bound(self, sample: ShardQueries, unit: float) -> None:
-        """Bound what is learned beside the core by what it leaves of the training values."""
-        import torch
-
-        from mbtf_fit.data.queries import mean_value
-        from mbtf_fit.objective.noise import residual_bound
-
-        at = (sample.u, sample.sigma, sample.omega_i, sample.omega_o)
-        core = self.material.hints(*(torch.from_numpy(a) for a in at))[:, 4:].numpy()
-        residuals = mean_value(sample.value_a, sample.value_b) - core
-        self.material.number("most").fill_(residual_bound(residuals, unit))
 
     def precompute(self, queries: Any, memory: float) -> Any:
         if not hasattr(queries, "hints") or len(queries) * (QUERY_BYTES + HINT_BYTES) > memory:

@@ -33,8 +33,8 @@ _MOST_NOISE = 5.0
 # Fraction of the queries, the brightest, that the ratio omits: highlights, whose variance would hide the
 # noise of all others, and outliers.
 _BRIGHTEST = 0.01
-# Least and most bound of learned values, in units; share of the values that exceed the bound beside a core.
-_LEAST_BOUND, _MOST_BOUND, _BEYOND = 10.0, 1e30, 1e-4
+# Least and most bound of learned values, in units.
+LEAST_BOUND, _MOST_BOUND = 10.0, 1e30
 
 
 def value_bound(values: ArrayLike, unit: float) -> float:
@@ -43,21 +43,8 @@ def value_bound(values: ArrayLike, unit: float) -> float:
     Networks that learn logarithms may answer more by orders of magnitude between the directions of the data.
     The factor is for highlights that no query meets at their peak, the least bound for few queries.
     """
-    return _in_units(2.0 * float(np.max(values, initial=0.0)), unit)
-
-
-def residual_bound(residuals: NDArray[np.float32], unit: float) -> float:
-    """Bound of learned values in units, where known single scattering is added to them: what a ten-thousandth
-    of the residuals (n, 3) of training values exceeds.
-
-    The highlights are in the known part, few others are missed. Learned from single queries, these would
-    recur at wrong directions: more is lost by false glints than by bounded ones.
-    """
-    return _in_units(float(np.quantile(residuals.max(1), 1.0 - _BEYOND)) if len(residuals) else 0.0, unit)
-
-
-def _in_units(bound: float, unit: float) -> float:
-    return min(max(_LEAST_BOUND, bound / unit), _MOST_BOUND) if unit > 0.0 else _LEAST_BOUND
+    largest = 2.0 * float(np.max(values, initial=0.0))
+    return min(max(LEAST_BOUND, largest / unit), _MOST_BOUND) if unit > 0.0 else LEAST_BOUND
 
 
 def typical_value(values: ArrayLike) -> float:

@@ -65,7 +65,7 @@ class NeuralMaterial(nn.Module):
         for op in reversed(operations):
             self._create(op, sizes, moves=op.output in moving)
         for tensor in _scalars(operations):
-            self.register_buffer(tensor, torch.full((), UNBOUNDED if tensor in _bounds(operations) else 1.0))
+            self.register_buffer(tensor, torch.full((), UNBOUNDED if tensor in self.bounds else 1.0))
         self.register_buffer(CALIBRATION, None)
 
     def _create(self, op: ops.Operation, sizes: Mapping[str, int], *, moves: bool) -> None:
@@ -120,7 +120,7 @@ class NeuralMaterial(nn.Module):
             for index, start in starts.get(name, {}).items():
                 last_bias.data[index] = start
         for tensor in _scalars(self._own):
-            self.number(tensor).fill_(most if tensor in _bounds(self._own) else unit)
+            self.number(tensor).fill_(most if tensor in self.bounds else unit)
 
     def run(
         self, wanted: Sequence[str], given: Mapping[str, Tensor], grid: tuple[int, int] | None = None
@@ -236,6 +236,11 @@ class NeuralMaterial(nn.Module):
         assert self.tracing is not None
         with torch.no_grad():
             return compute_hints(self.known, *self.tracing, u, sigma, omega_i, omega_o)
+
+    @property
+    def bounds(self) -> set[str]:
+        """Tensors () that bound learned values."""
+        return {op.most for op in self._own if isinstance(op, ops.Transform) and op.most is not None}
 
     def texture(self, name: str) -> FeatureTextures:
         """Learned textures by name."""
@@ -383,11 +388,6 @@ def _check_surface(operations: Sequence[ops.Operation]) -> None:
                 f"{op.kind()} '{op.output}' reads '{min(other)}', which is not of the surface: "
                 + ", ".join(sorted(surface))
             )
-
-
-def _bounds(operations: Sequence[ops.Operation]) -> set[str]:
-    """Tensors () of a list that bound values."""
-    return {op.most for op in operations if isinstance(op, ops.Transform) and op.most is not None}
 
 
 def _scalars(operations: Sequence[ops.Operation]) -> list[str]:

@@ -1,9 +1,12 @@
-"""The state of a fit with the smallest validation error.
+"""The state of a fit with the smallest validation error, and the bound of its values.
 
 A fit that overfits is best before its end. Its last state is replaced only where an earlier one is better
 beyond noise and by a twentieth, by the difference of both errors on the same validation queries, whose noise
 mostly cancels. So the choice among states hardly biases the errors that are reported, and other fits are as
 they were.
+
+Rare highlights are learned from single queries, and recur as false glints at directions between. Validation
+finds out what is lost by a lower bound of the values, and what by the glints.
 """
 
 from __future__ import annotations
@@ -18,12 +21,15 @@ from torch import Tensor
 
 from mbtf_core.stats import Estimate, mse_difference, noise_free_mse, signal_variance
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.training.trainer import TrainingProgress
+from mbtf_fit.objective.noise import LEAST_BOUND
+from mbtf_fit.training.trainer import Trainer, TrainingProgress
 
 # Standard errors that make a difference significant. A single false highlight, which is how fits of gloss
 # overfit, makes a difference of one standard error, however bright it is. Its least share of the best error:
 # paired errors resolve differences that do not matter.
 _SIGNIFICANT, _LEAST = 1.5, 0.05
+# Bounds of the values that are compared.
+_TRIED = 4
 # Steps of the first state that may be kept, and how many there are until twice the steps.
 _FIRST, _PER_OCTAVE = 32, 2
 
@@ -80,6 +86,26 @@ def overfits(
         for prediction, queries in zip(best, subsets, strict=True)
     ]
     return excess.value > max(_SIGNIFICANT * excess.error, _LEAST * sum(errors))
+
+
+def lower_bound(trainer: Trainer, queries: ShardQueries) -> None:
+    """Divide the bound of learned values by the power of 4 with the smallest error of validation queries, if
+    that is smaller by a twentieth. The bound stays at least :data:`~mbtf_fit.objective.noise.LEAST_BOUND`."""
+    bounds = [trainer.model.number(name) for name in trainer.model.bounds]
+    if not bounds or len(queries) == 0:
+        return
+    first, errors = float(bounds[0]), dict[float, float]()
+    for k in range(_TRIED):
+        most = first / 4.0**k
+        if k > 0 and most < LEAST_BOUND:
+            break
+        for bound in bounds:
+            bound.fill_(most)
+        errors[most] = noise_free_mse(trainer.predict(queries), *queries.halves).value
+    best = min(errors, key=lambda most: errors[most])
+    chosen = best if errors[best] < (1.0 - _LEAST) * errors[first] else first
+    for bound in bounds:
+        bound.fill_(chosen)
 
 
 def _unit(queries: ShardQueries) -> float:

@@ -25,6 +25,7 @@ from mbtf_fit.formatting import format_estimate, headline
 from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.material.material import Material
+from mbtf_fit.training.best_state import lower_bound
 from mbtf_fit.training.endings import describe_validations, kept_step, reached
 from mbtf_fit.training.fit_export import Member, export_fits
 from mbtf_fit.training.fit_folder import (
@@ -337,6 +338,8 @@ def _train(
         _spend_budget(loop, report, checkpoint)
     trained = loop.progress
     loop.keep_best(validation)
+    for trainer, queries in zip(trainers, validation, strict=True):
+        lower_bound(trainer, queries)
     export_fits(
         config,
         loop,

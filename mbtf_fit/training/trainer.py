@@ -352,8 +352,7 @@ def prepare_trainer(
         return part.training.to(device), typical
 
     hooks, training = model_class(config.model)(model), partition.training.to(device)
-    given = Preparation(data, training, partition.sample, config.training, unit, config.seed, load)
-    training = hooks.prepare(given)
+    training = hooks.prepare(Preparation(data, training, config.training, unit, config.seed, load))
     if config.init_from is not None:
         _initialize_from(hooks, config.init_from)
     if config.decoder is not None:

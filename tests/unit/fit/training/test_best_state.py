@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,10 +17,11 @@ from support.killed_fits import Killed, kill_in
 
 import mbtf_fit.training.fit as fits
 import mbtf_fit.training.loop as loop
+import mbtf_fit.training.trainer as trainers
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.training.best_state import excess_error, overfits
+from mbtf_fit.training.best_state import excess_error, lower_bound, overfits
 from mbtf_fit.training.endings import describe_kept
 from mbtf_fit.training.fit import FitResult, fit
 from mbtf_fit.training.trainer import Trainer
@@ -130,6 +132,39 @@ def test_a_fit_keeps_its_last_state_unless_another_is_better_beyond_noise(
     assert found.kept_step is None
     assert found.material.description["training"]["kept_step"] == STEPS
     assert describe_kept(found.history, found.kept_step) is None
+
+
+def test_a_fit_lowers_the_bound_of_its_values_where_glints_are_false(
+    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One prediction in 30 is as bright as the bound: by 4³ of the first one, as the least is reached."""
+    bounds: list[float] = []
+
+    def predict(trainer: Trainer, queries: ShardQueries) -> NDArray[np.float32]:
+        bounds.append(float(trainer.model.number("most")))
+        glint = np.where(np.arange(len(queries)) % 30 == 0, bounds[-1], 0.0)[:, None]
+        return np.float32(0.5 * (queries.value_a + queries.value_b) + glint)
+
+    monkeypatch.setattr(Trainer, "predict", predict)
+    monkeypatch.setattr(trainers, "value_bound", lambda values, unit: 1000.0)
+    found = fit(config(), shards, tmp_path / "m")
+    assert bounds[0] == 1000.0
+    assert float(found.material.model.number("most")) == pytest.approx(1000.0 / 4**3)
+
+
+def test_the_bound_stays_above_highlights_that_the_data_confirm() -> None:
+    """Those of 100; twice the bound of the first."""
+    most = torch.tensor(200.0)
+    arrays = random_queries(np.random.default_rng(0), 3000, Lattice(3))
+    value = np.full((3000, 3), 0.1, np.float32)
+    value[::30] = 100.0
+    queries = ShardQueries(*arrays.values(), value, value)
+    trainer = SimpleNamespace(
+        model=SimpleNamespace(bounds={"most"}, number=lambda name: most),
+        predict=lambda queries: np.minimum(1.05 * value, float(most)),
+    )
+    lower_bound(cast(Trainer, trainer), queries)
+    assert float(most) == 200.0
 
 
 def test_the_excess_is_paired_and_relative_to_the_variance() -> None:

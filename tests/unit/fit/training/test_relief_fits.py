@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from support.fit_data import parallax, random_queries, write_data
 from support.known_surfaces import geometry, rough_heights
 from support.paths import ROOT
@@ -78,23 +77,6 @@ def test_pytorch_fits_as_the_kernel_does(
     # Not the loss: it is the mean since the last report, which a busy machine sends after fewer steps.
     errors = [r.errors["test"]["unexplained"]["value"] for r in (compiled, plain)]
     assert errors[1] == pytest.approx(errors[0], rel=1e-2)
-
-
-def test_the_learned_part_is_bounded_by_what_the_core_leaves(shards: Path, tmp_path: Path) -> None:
-    """One light in a hundred queries beside the highlights of the core, which are brighter."""
-    known = fit(config(1), shards, tmp_path / "m").material.model
-
-    def values(*at: NDArray[np.float32]) -> NDArray[np.float32]:
-        core = known.hints(*map(torch.from_numpy, at))[:, 4:].numpy()
-        return 1e-3 + core + 0.5 * (np.arange(len(core)) % 100 == 0)[:, None]
-
-    again = write_data(tmp_path / "data", values, train=3000, test=10, aspect=0.75, geometry=ROUGH)
-    found = fit(config(1), again, tmp_path / "n").material.model
-    largest = max(
-        float(shard.read(("value_a",))["value_a"].max()) for shard in Dataset.open(again).shards("train")
-    )
-    assert float(found.number("most") * found.number("unit")) == pytest.approx(0.501, rel=0.1)
-    assert largest > 1.0
 
 
 def test_a_material_keeps_its_surface(shards: Path, tmp_path: Path) -> None:
