@@ -69,21 +69,23 @@ def split_errors(
         Plain data for JSON. ``mse`` E[(p-a)(p-b)] and ``variance`` of the values, in 1/sr², and their ratio
         ``unexplained`` (1 - R²: 0 is exact, 1 as good as the mean value), each an estimate with ``value``,
         ``error`` and ``n``, also by nearest level (``levels``) and by band of the smaller cosine of light and
-        view (``elevations``); ``color``: what is unexplained of the differences between channels, a small
-        part of all; ``ten_largest``: share of the ten largest squared errors in their sum; ``outliers``:
-        those that noise does not explain, and where the first is; ``psnr``: its peak is the value that the
-        exposure shows as white; ``visibility``: in words; ``includes_noise``: whether the data have one value
-        per query.
+        view (``elevations``); ``color``: what is unexplained of the differences between channels, and their
+        ``share`` of the variance; ``ten_largest``: share of the ten largest squared errors in their sum;
+        ``outliers``: those that noise does not explain, and where the first is; ``psnr``: its peak is the
+        value that the exposure shows as white; ``visibility``: in words; ``includes_noise``: whether the data
+        have one value per query.
     """
     if len(queries) == 0:
         return None
     exposure = exposure_of(queries) if exposure is None else exposure
     arrays = predict(queries), *queries.halves
     mse = noise_free_mse(*arrays)
-    colors = _color(arrays[0]), _color(queries.value_a), _color(queries.value_b)
+    colors = _color(queries.value_a), _color(queries.value_b), queries.weight, queries.group
+    variance, of_colors = signal_variance(*arrays[1:]), signal_variance(*colors).value
     found = {
-        **_errors(len(queries), mse, signal_variance(*arrays[1:]), unexplained_variance(*arrays)),
-        "color": unexplained_variance(*colors, queries.weight, queries.group).as_dict(),
+        **_errors(len(queries), mse, variance, unexplained_variance(*arrays)),
+        "color": unexplained_variance(_color(arrays[0]), *colors).as_dict()
+        | {"share": of_colors / variance.value if variance.value > 0 else 0.0},
         "exposure": exposure,
         **_largest_errors(arrays[0], queries),
     }

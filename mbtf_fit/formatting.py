@@ -28,6 +28,8 @@ ABOVE_ONE = "above 1: worse than the mean value"
 _DECISIVE, _MANY = 1 / 3, 1000
 # Share of an error from which its outliers are named.
 _OUTLYING = 0.25
+# Colors that make this share of the variance are missed where so much of them is unexplained.
+_COLORED, _UNLEARNED = 0.02, 0.5
 # Standard errors of a significant difference from zero.
 _SIGNIFICANT = 2.0
 
@@ -132,6 +134,10 @@ def _remarks(errors: Mapping[str, Any], foreign: bool) -> list[str]:
     if measured:
         found.append("these errors include the noise of the data, which have one value per query")
     found += outliers(split)
+    color = split["color"]
+    known = color.get("share", 0.0) >= _COLORED and color["value"] is not None
+    if known and color["value"] - _SIGNIFICANT * (color["error"] or 0.0) > _UNLEARNED:
+        found.append(f"colors are hardly learned: {format_estimate(color)} of their variance is unexplained")
     return found if foreign else [*found, *above_one(split["unexplained"])]
 
 

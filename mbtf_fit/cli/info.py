@@ -90,6 +90,7 @@ def _material_info(path: Path, verbose: bool) -> tuple[dict[str, Any], str]:
     from mbtf_fit.material.format import WEIGHTS_NAME
     from mbtf_fit.material.material import Material
     from mbtf_fit.native import describe
+    from mbtf_fit.training.endings import kept_step
 
     material = Material.load(path)
     description = material.description
@@ -97,12 +98,14 @@ def _material_info(path: Path, verbose: bool) -> tuple[dict[str, Any], str]:
     size = (path / WEIGHTS_NAME).stat().st_size
     deviation = material.deviation()
     rows, columns = material.lattice.shape()
+    kept = kept_step(training)
+    state = "" if kept is None else f", state of step {kept} kept"
     lines = [
         f"{path}: {description['model']}, levels 0 to {material.lattice.finest}, finest {columns} x {rows} "
         f"texels, aspect {material.lattice.aspect:g}; {weights['network_weights']} network weights, "
         f"{weights['texels']} texture values, {size / 1e6:.2f} MB",
         f"trained for {training['steps']} steps of {training['batch']} queries in "
-        f"{clock(training['seconds'])}; evaluation on this CPU: {describe()}; conformance: "
+        f"{clock(training['seconds'])}{state}; evaluation on this CPU: {describe()}; conformance: "
         f"{description['conformance']['count']} queries, largest deviation {deviation:.2g}",
         *report_errors(training["errors"], training.get("transmittance"), verbose),
     ]

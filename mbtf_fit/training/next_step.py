@@ -17,8 +17,10 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.formatting import headline, unreliable
 from mbtf_fit.training.validation import FEWEST_STEPS, FLAT, MarginalCost
 
-# Below so many steps, the error itself says little.
-_UNTRAINED = 100
+# Below so many steps, the error itself says little; few steps with a larger error are not enough.
+_UNTRAINED, _HARDLY = 100, 0.5
+# Factor of the error by which twice the training pays more than better data after few steps.
+_PAYS = 0.9
 # Relative standard error of the test error from which more test queries come first.
 _UNCERTAIN = 0.25
 # Standard errors of a significant difference.
@@ -102,10 +104,11 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     # A fit that kept an earlier state has trained long enough. Others, after few steps, are limited by noise
     # only where it leaves nothing to longer training.
     few = cost.few and cost.kept_step is None
-    learns = few and (cost.doubling is None or cost.doubling < FLAT)
+    learns = few and (cost.doubling is None or cost.doubling < _PAYS)
     overfit, limit = (0.0, 0.0) if learns else (0.5 * (cost.noise_share or 0.0), _LIMITED * cost.noise_limit)
     data = 1.0 - max(overfit, limit)
-    if few and (value is None or value >= 1.0 or cost.steps < _UNTRAINED):
+    most = _HARDLY if data >= FLAT else 1.0
+    if few and (value is None or value >= most or cost.steps < _UNTRAINED):
         factor = 2 ** math.ceil(math.log2(FEWEST_STEPS / cost.steps))
         return NextStep("time", f"{cost.steps} steps are few: train {factor} times as long", factor)
     short = ""

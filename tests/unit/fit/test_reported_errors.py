@@ -106,3 +106,15 @@ def test_an_undefined_error_has_its_psnr_and_its_column() -> None:
     assert all(name in header for name in ("test queries", "held-out queries", "training queries"))
     assert "held-out queries unreliable" in text
     assert "training queries unreliable" not in text
+
+
+@pytest.mark.parametrize(
+    ("value", "share", "said"),
+    [(0.83, 0.15, True), (0.25, 0.15, False), (0.83, 2e-4, False), (None, 0.0, False)],
+)
+def test_colors_that_are_hardly_learned_are_said(value: float | None, share: float, said: bool) -> None:
+    """A cloth in three colors whose green was brown: its unexplained variance was 0.321."""
+    color = {"value": value, "error": None if value is None else 0.005, "share": share}
+    split = {"n": 8192, "unexplained": {"value": 0.321, "error": 0.011}, "color": color}
+    split |= {"mse": {"value": 0.001, "error": 1e-5}, "exposure": 0.0, "ten_largest": 0.1}
+    assert any("colors are hardly learned" in line for line in report_errors({"test": split}, None)) == said

@@ -153,6 +153,8 @@ def test_errors_of_a_perfect_prediction_are_zero(data: Path) -> None:
     # Of color likewise, although its noise is as large as its variance.
     assert abs(perfect["color"]["value"]) < 4 * perfect["color"]["error"]
     assert flat["color"]["value"] == pytest.approx(1.0, abs=0.05)
+    differences = truth - np.roll(truth, 1, axis=1)
+    assert flat["color"]["share"] == pytest.approx(differences.var(0).mean() / truth.var(0).mean(), rel=0.2)
     for groups in (flat["levels"], flat["elevations"]):
         assert sum(errors["n"] for errors in groups.values()) == len(queries)
     assert set(flat["elevations"]) == {"0-0.2", "0.2-0.4", "0.4-0.7", "0.7-1"}

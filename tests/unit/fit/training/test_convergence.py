@@ -109,6 +109,10 @@ def test_only_a_flat_curve_says_that_longer_training_is_useless() -> None:
     # Overfitting after 146 steps that still learn; none of them, where noise leaves nothing.
     assert next_step(MarginalCost(0.85, 0.5, 146), fitted(0.6, 0.01)).kind == "time"
     assert next_step(MarginalCost(0.99, 0.5, 146), fitted(0.6, 0.01)).kind == "queries"
+    # Few steps whose error is hardly below 1, and few that gain little, measured by few bright queries.
+    assert next_step(MarginalCost(0.97, None, 200), fitted(0.82, 0.04)).kind == "time"
+    decisive = {"test": fitted(0.26, 0.05)["test"] | {"n": 8192, "ten_largest": 0.47}}
+    assert next_step(MarginalCost(0.947, None, 283), decisive).kind == "test"
     # An error as uncertain as that of a glossy metal tells neither.
     for records in (history(0.02, error=0.4), history(0.25, error=0.4)):
         assert cost(records, {}).doubling is None
