@@ -56,9 +56,8 @@ def forecast_errors(recipe: Recipe, folder: Path, note: Callable[[str], None]) -
             forecast = forecast_fit(fit, folder / data.sub).error
             found[name] = {"source": "pilots", "text": forecast.describe(), "forecast": forecast.as_dict()}
         else:
-            if data.sub not in missing:
-                missing[data.sub] = _no_forecast(fit, folder / data.sub)
-            found[name] = {"source": None, "text": missing[data.sub]}
+            text = missing.setdefault(data.sub, _no_forecast(fit, folder / data.sub))
+            found[name] = {"source": None, "text": text}
     return found
 
 
