@@ -133,7 +133,7 @@ def _draw_missing(
             write_png(folder.path / SHEET_NAME, contact_sheet(values, config.sheet, exposure))
             facts = {"exposure": exposure, "of": config.exposure}
             folder.keep(SHEET_NAME, [folder.path / SHEET_NAME], facts)
-        bar.advance(1)
+        bar.advance(1, "turntable; --sheet-only leaves it out" if turns else None)
         if turns:
             pictures = []
             for picture in frames(bsdf, config.turntable):

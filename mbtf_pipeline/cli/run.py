@@ -166,9 +166,12 @@ def _forecast(recipe: Recipe, folder: Path, console: Console) -> None:
     training = {name: found["forecast"]["seconds"] for name, found in errors.items() if found["source"]}
     expected = forecaster.of(recipe, training=training)
     lines = [expected.describe()]
+    by_text: dict[str, list[str]] = {}
     for name, found in errors.items():
-        first, *more = found["text"].splitlines()
-        lines += [f"  {name}: {first}", *(f"    {m}" for m in more)]
+        by_text.setdefault(found["text"], []).append(name)
+    for text, names in by_text.items():
+        first, *more = text.splitlines()
+        lines += [f"  {', '.join(names)}: {first}", *(f"    {m}" for m in more)]
     console.report({"seconds": expected.seconds, "bytes": expected.bytes, "fits": errors}, "\n".join(lines))
 
 

@@ -6,7 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from mbtf_core.app.options import command_line
 from mbtf_core.data.dataset import is_dataset
+from mbtf_core.units import format_duration
 from mbtf_fit.config import FitConfig
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import DataSet, data_sets, layout_of, survey
@@ -45,6 +47,8 @@ def forecast_errors(recipe: Recipe, folder: Path, note: Callable[[str], None]) -
     stale = survey(recipe, folder)
     data_of: dict[str, DataSet] = {data.config.queries.layout: data for data in data_sets(recipe)}
     found: dict[str, dict[str, Any]] = {}
+    # By data set, as the reason is the same for all its fits.
+    missing: dict[str, str] = {}
     for name, fit in recipe.fit.items():
         data = data_of[layout_of(fit)]
         if not stale[data.stage] and is_dataset(folder / data.sub):
@@ -52,6 +56,18 @@ def forecast_errors(recipe: Recipe, folder: Path, note: Callable[[str], None]) -
             forecast = forecast_fit(fit, folder / data.sub).error
             found[name] = {"source": "pilots", "text": forecast.describe(), "forecast": forecast.as_dict()}
         else:
-            text = f"no forecast of the error: {folder / data.sub} has no data of these options yet"
+            text = missing.setdefault(data.sub, _no_forecast(fit, folder / data.sub))
             found[name] = {"source": None, "text": text}
     return found
+
+
+def _no_forecast(fit: FitConfig, path: Path) -> str:
+    """Why a fit has no forecast, and the command of one on the data that are there, if of other options."""
+    text = f"no forecast of the error: {path} has no data of these options yet"
+    if not is_dataset(path):
+        return text
+    training = fit.training
+    time = None if training.steps else format_duration(training.time.seconds)
+    budget = {"steps": training.steps, "time": time, "error": training.error}
+    command = command_line("mbtf-fit", path, model=fit.model, **budget, dry_run=True)
+    return f"{text}; of those that it has: {command}"

@@ -190,6 +190,16 @@ class Measurements:
         runs = planned_runs(0.0, spp, self.path_seconds)
         return None if self._besides else self._study_seconds(runs, setup)
 
+    def seconds_for(self, work: float, *, spp: int, setup: float, seconds: float) -> float:
+        """Likewise of one of at least `seconds` whose longest run generates and trains for `work` seconds."""
+        while True:
+            missing = []
+            for run in self.plan_runs(seconds, spp):
+                missing += [] if self.recall(run) else [run]
+                if run.planned_seconds(self.path_seconds, self.step_seconds) >= work:
+                    return max(seconds, self._study_seconds(missing, setup))
+            seconds *= 1.1
+
     def _study_seconds(self, runs: Sequence[Run], setup: float) -> float:
         """Seconds of a study that has time for some runs, and makes the test set anew."""
         planned = (run.planned_seconds(self.path_seconds, self.step_seconds) for run in runs)

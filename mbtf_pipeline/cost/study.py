@@ -11,7 +11,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +23,9 @@ from mbtf_core.files.folders import ELSEWHERE, OutputKind, check_space, owned
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item
 from mbtf_core.stats import Estimate
-from mbtf_core.units import expectation, format_duration, rounded_duration
+from mbtf_core.units import clock, expectation, format_duration, rounded_duration
 from mbtf_gen.job import Job
-from mbtf_pipeline.cost.answers import Evidence, is_significant
+from mbtf_pipeline.cost.answers import FARTHEST, Evidence, is_significant
 from mbtf_pipeline.cost.conditions import (
     CONFIG_NAME,
     conditions_of,
@@ -67,6 +67,8 @@ class Study:
     # Seconds of a study that measures a run, and of one that forecasts; None where this one does.
     least_run: float | None = None
     least: float | None = None
+    # Seconds of a study whose longest run takes so many of generating and training.
+    seconds_for: Callable[[float], float] | None = None
 
     @cached_property
     def evidence(self) -> Evidence:
@@ -75,9 +77,14 @@ class Study:
 
     @property
     def more(self) -> str:
-        """Which longer study would measure a run or forecast, in one sentence; empty where this one does."""
+        """Which longer study would measure a run, forecast, or forecast longer times, in one sentence."""
         if self.least is None:
-            return ""
+            found = self.evidence
+            if self.seconds_for is None or found.curve is None or (target := found.next_time) is None:
+                return ""
+            longer = rounded_duration(self.seconds_for((target - found.overhead) / FARTHEST))
+            ends, reaches = clock(found.farthest), format_duration(target)
+            return f"the forecast ends at {ends}: repeat the command with --time {longer} to reach {reaches}"
         if self.least_run is not None:
             return no_run(self.least_run, self.least)
         runs = [m for m in self.measurements if m.study == "run"]
@@ -242,4 +249,5 @@ def run_study(
         [f"{label}: {why}" for label, why in failed.items()],
         least_run=measurements.least_run_seconds(spp, setup),
         least=measurements.least_seconds(spp, setup),
+        seconds_for=partial(measurements.seconds_for, spp=spp, setup=setup, seconds=seconds),
     )

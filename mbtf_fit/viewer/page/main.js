@@ -18,7 +18,9 @@ function statusLine(viewer, test) {
   else if (frames) progress = `smoothing edges: frame ${frames} of ${FRAMES}, ${timeText(full)} each`;
   else if (row)
     progress = `drawing in full resolution: ${Math.floor((100 * row) / height)}%${full < 1 ? "" : ` of ${timeText(full)}`}`;
-  const beyond = test?.beyond ? `, ${test.beyond} of ${test.count} test queries deviate` : "";
+  const beyond = test?.beyond
+    ? `, ${test.beyond} of ${test.count} test queries deviate, by up to ${Number((100 * test.largest).toPrecision(2))}%`
+    : "";
   return `${tilesText(camera.tiles_across)} across, a pixel is ${texels} texel${texels === 1 ? "" : "s"} wide (level ${level.toFixed(1)} of ${finest}), ${progress}${beyond}`;
 }
 

@@ -41,6 +41,11 @@ def test_values_are_those_of_the_material(driver: Any, tmp_path: Path) -> None:
         assert test["beyond"] == (exact.max(1) > 1e-2).sum()
     # The texels of random materials are noise, which is the hardest to round.
     assert sum(test["beyond"] for test in tests) < 40
+    # On devices with other rounding.
+    page.js("Object.assign(window.mbtf.tests[0], { beyond: 1, count: 256, largest: 0.02345 })")
+    page.js("window.mbtf.viewer.draw = () => true")
+    status = "return document.getElementById('status').textContent"
+    page.until(lambda: page.js(status).endswith(", 1 of 256 test queries deviate, by up to 2.3%"))
     assert page.faults() == []
 
 

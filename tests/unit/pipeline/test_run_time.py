@@ -18,6 +18,8 @@ from mbtf_core.files import folders
 from mbtf_pipeline import run as runs
 from mbtf_pipeline import run_time as module
 from mbtf_pipeline.cli.app import app
+from mbtf_pipeline.cost import forecast
+from mbtf_pipeline.cost.forecast import forecast_errors, has_error
 from mbtf_pipeline.recipe import load_recipe, preset_recipe
 from mbtf_pipeline.run_time import RunForecaster, TimedRun, forecast_left
 
@@ -160,3 +162,16 @@ def test_a_run_states_its_cost_and_is_refused_if_the_disk_is_full(
     assert not out.exists()
     with pytest.raises(InputError, match="holds no run"):
         forecast_left(load_recipe(FILE), ROOT / "pipelines")
+
+
+def test_without_data_one_command_forecasts_the_errors_of_all_fits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe, shards = has_error(load_recipe(FILE), 0.2), tmp_path / "shards"
+    texts = {found["text"] for found in forecast_errors(recipe, tmp_path, lambda note: None).values()}
+    assert texts == {f"no forecast of the error: {shards} has no data of these options yet"}
+    # Those of another preset.
+    monkeypatch.setattr(forecast, "is_dataset", lambda path: path == shards)
+    (text,) = {found["text"] for found in forecast_errors(recipe, tmp_path, lambda note: None).values()}
+    command = f"mbtf-fit {shards} --model relief --time 1min --error 0.2 --dry-run"
+    assert text.endswith(f"; of those that it has: {command}")
