@@ -33,8 +33,8 @@ from mbtf_pipeline.stages import RUN, write_run_record
 _START, _COMPARE = 2.5, 5.0
 # Bytes of a pixel of a reference and of a fit's image.
 _REFERENCE_BYTES, _FIT_BYTES = 70, 30
-# Seconds of starting and of a path where no pilot was run: those of a slow machine.
-_SLOW = (0.0, 2e-6)
+# Seconds of starting, of a path and of a training step where no pilot was run: those of a slow machine.
+_SLOW, _SLOW_STEP = (0.0, 2e-6), 0.1
 
 SPLIT_NAME = "time_split.json"
 SPLIT_SCHEMA = 6
@@ -137,9 +137,9 @@ class RunForecaster:
         )
 
 
-def forecast_left(recipe: Recipe, folder: Path) -> RunForecast | None:
-    """Forecast of the stages that a run in a folder has yet to do; None where they are short and small on any
-    machine.
+def forecast_left(recipe: Recipe, folder: Path, draft: Recipe) -> str | None:
+    """Forecast of the stages that a run in a folder has yet to do, as a line with faster options: `draft` is
+    the recipe at that preset. None where they are short and small on any machine.
 
     Raises
     ------
@@ -151,7 +151,13 @@ def forecast_left(recipe: Recipe, folder: Path) -> RunForecast | None:
     expected = forecaster.of(recipe, stages, _SLOW)
     hint = "reduce generate.queries with --set or --quality, or choose another folder with -o"
     check_space(folder, expected.bytes, hint)
-    return forecaster.of(recipe, stages) if is_long(expected.seconds, expected.bytes) else None
+    if not is_long(expected.seconds, expected.bytes):
+        return None
+    expected, other = forecaster.of(recipe, stages), forecaster.of(draft)
+    training = max(other.training, other.min_steps * _SLOW_STEP * len(draft.fit))
+    faster = ["--quality draft"] * (other.seconds - other.training + training < expected.seconds)
+    faster += ["--time 2min"] * (expected.seconds > 120.0)
+    return expected.describe() + (f"; faster: {', or '.join(faster)}" if faster else "")
 
 
 @dataclass(frozen=True)

@@ -57,6 +57,7 @@ def cost(
     from mbtf_core.run.cluster import open_runner
     from mbtf_core.run.signals import keep_on_interruption
     from mbtf_core.units import asked_duration, clock
+    from mbtf_fit.config import DEFAULT_MODEL
     from mbtf_pipeline.collection.recipes import load
     from mbtf_pipeline.cost.answers import answers
     from mbtf_pipeline.cost.measurement import other_work, pareto_front
@@ -69,6 +70,8 @@ def cost(
     if not isinstance(loaded, Recipe):
         raise UsageError("has several materials", where=recipe, hint="study the recipe of one of them")
     check_error(error)
+    if len(loaded.fit) > 1:
+        console.note(f"only {DEFAULT_MODEL} is studied, with networks that suit the times; no other fit")
     seconds = asked_duration(time, "--time")
     more = 0.0 if refine is None else asked_duration(refine, "--refine")
     folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")

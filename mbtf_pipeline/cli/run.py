@@ -124,8 +124,9 @@ def run(
             from mbtf_pipeline.run_time import forecast_left
 
             loaded, generated = has_error(preset_recipe(recipe, quality, own), error), None
-            if not dry_run and (expected := forecast_left(loaded, folder)) is not None:
-                console.note(f"{expected.describe()}; faster: --quality draft, or --time 2min")
+            draft = preset_recipe(recipe, "draft", own)
+            if not dry_run and (expected := forecast_left(loaded, folder, draft)) is not None:
+                console.note(expected)
         else:
             from mbtf_core.units import asked_duration
             from mbtf_pipeline.run_time import TimedRun

@@ -57,6 +57,9 @@ class StudyPlan:
         known = f", {self.measured} measured already" if self.measured else ""
         ends = ":" if self.runs else ""
         expected = expectation(self.seconds, self.bytes)
+        if not self.runs and self.least_run is not None:
+            load = f"with {self.share:.0%} of the processors free"
+            return f"complete runs to measure: none; {load}, {no_run(self.least_run, self.least)}"
         lines = [f"{expected}; complete runs to measure: {len(self.runs) or 'none'}{known}{ends}"]
         lines += [f"  {label}" for label in self.runs]
         if self.least_run is not None:
@@ -65,8 +68,6 @@ class StudyPlan:
                 f"processors, and {self.overhead:.0f} s per run for loading and evaluation; the first run "
                 "measures training and the rest, so fewer runs may fit and a forecast may take longer"
             )
-        if not self.runs and self.least_run is not None:
-            return "\n".join([*lines, no_run(self.least_run, self.least)])
         lines.append(f"answers: the error after times of up to about {clock(self.longest)}, measured")
         if asked >= self.least:
             far = clock(FARTHEST * self.longest)

@@ -153,7 +153,10 @@ def test_a_run_states_its_cost_and_is_refused_if_the_disk_is_full(
     monkeypatch.setattr(runs, "run_recipe", stop)
     out = tmp_path / "out"
     assert run(app, ["run", str(FILE), "-o", str(out)]) == 130
-    assert "expected: about 3:" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "expected: about 3:" in said
+    # Three drafts of 800 steps may take longer.
+    assert "faster: --time 2min" in said
     fake.free = 1e6
     assert run(app, ["run", str(FILE), "-o", str(out)]) == 3
     problem, hint = capsys.readouterr().err.splitlines()
@@ -161,7 +164,23 @@ def test_a_run_states_its_cost_and_is_refused_if_the_disk_is_full(
     assert "--set" in hint
     assert not out.exists()
     with pytest.raises(InputError, match="holds no run"):
-        forecast_left(load_recipe(FILE), ROOT / "pipelines")
+        forecast_left(load_recipe(FILE), ROOT / "pipelines", load_recipe(FILE))
+
+
+def test_a_draft_is_suggested_where_its_steps_take_less_on_slow_machines(fake: Machine, one: Path) -> None:
+    """800 of them, of a tenth of a second."""
+
+    def suggested(seconds: int) -> str | None:
+        text = ONE.replace("neumip}", f"neumip, training: {{time: {seconds}s}}}}")
+        one.write_text(text.replace("npy,", "npy, queries: {resolution: 64, train: 100/texel},"))
+        recipe, draft = preset_recipe(one, None), preset_recipe(one, "draft")
+        return forecast_left(recipe, one.parent / "none", draft)
+
+    short, long = suggested(30), suggested(200)
+    assert short is not None
+    assert long is not None
+    assert "faster" not in short
+    assert long.endswith("; faster: --quality draft, or --time 2min")
 
 
 def test_without_data_one_command_forecasts_the_errors_of_all_fits(

@@ -211,6 +211,9 @@ def test_a_plan_writes_nothing_and_has_fewer_runs_beside_other_work(
     assert (free.overhead, busy.overhead) == (schedule.OVERHEAD, 4 * schedule.OVERHEAD)
     assert 0 < len(busy.runs) < len(free.runs)
     assert busy.least > free.least
+    none = plan.plan_study(recipe, tmp_path / "study", seconds=30.0).describe(30.0)
+    assert none.startswith("complete runs to measure: none; with 25% of the processors free, no complete run")
+    assert "expected" not in none
     assert not (tmp_path / "study").exists()
 
 
