@@ -385,7 +385,7 @@ class View:
             return value if hit is None else value * hit.share
         values = evaluator.stage1(self.u, self.level, viewer, hit.values)
         least = self.bsdf.min_cos
-        visible = hit.visibility(wo)
+        visible = hit.visibility(wo, least)
         lit = DirectLight(visible, wo, dr.maximum(wo.z, least), least, hit.flat)
         curved = hit.light_cosine(wo, least, visible)
         cosine *= dr.select(hit.flat, dr.maximum(wo.z, 0.0), curved)
