@@ -266,6 +266,8 @@ class ConePath(mi.SamplingIntegrator):
         """Transmittance of the surfaces between a hit and an emitter."""
         through, active = mi.Spectrum(1.0), mi.Bool(active)
         ray = si.spawn_ray_to(ds.p)
+        # Most rays meet no surface, whose hits would cost more.
+        active &= scene.ray_test(ray, active)
         while active:
             hit = scene.ray_intersect(ray, mi.RayFlags.All, False, active)
             active &= hit.is_valid()
