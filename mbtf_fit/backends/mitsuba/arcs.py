@@ -2,17 +2,18 @@
 
 The surface is the top of the shell, z = 0. Over the tangent plane of a curved surface a straight ray is an
 arc. With the normal curvature κ along the ray's azimuth, in 1/tile width and positive where the surface is
-convex, it has at distance t, from a view with the cosine c and the sine q, the position and the height
+convex, a ray from a view with the cosine c and the sine q has, at the distance s along the surface,
 
-    s = atan2(κ t q, 1 - κ t c) / κ,    z = t (κ t - 2 c) / (1 + √(1 + κ t (κ t - 2 c))),
+    z = S w / (q - 2 w sin h),  w = q sin h - c cos h,  h = κ s/2,  S = 2 sin(h)/κ,
 
 exact over spheres and across cylinders; to second order ``z = -s c/q + κ s²/2`` at grazing angles, the
 parabola of Oliveira and Policarpo 2005, "An efficient representation for surface details". It ends at the
 bottom of the shell, or leaves the shell without an intersection.
 
 Traversal is that of :mod:`mbtf_gen.tile.tracers.heightfield_tracer`, with a chord of the arc in each block.
-A chord deviates from the arc by less than ``κ m (1 + |∇|) Δt²/8``, with the slope ∇ of the block's plane and
-``m = (1 - κ D)⁻³`` at the depth D of the shell; blocks are skipped where the chord clears them by that.
+Over a concave surface the arc is above the chord. Over a convex one it is above the parabola of the largest
+second derivative ``κ (1 + 2 z'²)``: with heights f, g of the chord's ends above a block's plane, it clears
+the block if ``√f + √g > 2 √m``, where m is an eighth of that derivative times the chord's square.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ from mbtf_gen.tile.tracers.heightfield_tracer import (
 
 # Smallest sine of a view: a vertical ray has no azimuth.
 _STEEPEST = 1e-3
+# Smallest curvature of an arc, in 1/tile width.
+_STRAIGHTEST = 1e-9
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,8 @@ class Arc:
     cosine, sine : of the angle between the rays and the direction downwards
     curvature : normal curvature along the azimuth at the height where the rays start
     start, shrinkage : that height; lengths at the surface per length there
-    end, last : distances along the surface, and along the ray, at which the rays end
+    end : distance along the surface at which the rays end
+    bend : an eighth of the largest second derivative of their height, at least 0
     cut : whether a ray ends at the longest distance that is traced
     passes : whether it does not go as deep as the shell
     """
@@ -56,8 +60,9 @@ class Arc:
     curvature: Float
     start: Float
     shrinkage: Float
+    half_rate: Float
     end: Float
-    last: Float
+    bend: Float
     cut: Mask
     passes: Mask
 
@@ -71,6 +76,7 @@ class Arc:
         curvature = dr.dot(tilt(curvature, azimuth), azimuth)
         shrinkage = dr.rcp(1.0 + curvature * start)
         curvature = curvature * shrinkage
+        curvature = dr.mulsign(dr.maximum(dr.abs(curvature), _STRAIGHTEST), curvature)
         sine = dr.maximum(length, _STEEPEST)
         cosine = dr.mulsign(dr.sqrt(dr.maximum(1.0 - sine * sine, 1e-12)), -d.z)
         # Up to the bottom, or else up to the top.
@@ -94,37 +100,35 @@ class Arc:
             curvature,
             start,
             shrinkage,
+            0.5 * curvature / shrinkage,
             mi.Float(0.0),
-            last,
+            mi.Float(0.0),
             mi.Bool(False),
             to_bottom < 0.0,
         )
         end = arc.position(last)
         cut = end > longest
         end = dr.minimum(end, longest)
-        return replace(arc, end=end, last=dr.select(cut, arc.distance(end), last), cut=cut)
+        # Slopes are steepest at the ends.
+        steepest = dr.maximum(dr.abs(cosine / sine), dr.abs(arc.slope(end)))
+        bend = 0.125 * dr.maximum(2.0 * arc.half_rate, 0.0) * dr.fma(2.0, dr.square(steepest), 1.0)
+        return replace(arc, end=end, bend=bend, cut=cut)
 
     def position(self, t: Float) -> Float:
         """Distances along the surface at distances along the ray."""
         bent = self.curvature * t
-        below = 1.0 - bent * self.cosine
-        angle = dr.atan2(bent * self.sine, below)
-        near = t * self.sine / dr.maximum(below, 1e-3) * (1.0 - angle * angle / 3.0)
-        return self.shrinkage * dr.select(dr.abs(angle) < 1e-3, near, angle / self.curvature)
+        return self.shrinkage / self.curvature * dr.atan2(bent * self.sine, 1.0 - bent * self.cosine)
 
-    def distance(self, s: Float) -> Float:
-        """Inverse of :meth:`position`."""
-        s = s / self.shrinkage
-        angle = dr.clip(self.curvature * s, -3.0, 3.0)
-        sin, cos = dr.sincos(angle)
-        chord = s * dr.select(dr.abs(angle) < 1e-3, 1.0 - angle * angle / 6.0, sin / angle)
-        return chord / (self.sine * cos + self.curvature * chord * self.cosine)
+    def height(self, s: Float) -> Float:
+        """Heights at distances along the surface."""
+        sin, cos = dr.sincos(self.half_rate * s)
+        p = 2.0 * sin * dr.fma(self.sine, sin, -self.cosine * cos)
+        return self.start + p / (self.curvature * (self.sine - p))
 
-    def height(self, t: Float) -> Float:
-        """Heights at distances along the ray."""
-        bent = dr.fma(self.curvature, t, -2.0 * self.cosine)
-        root = dr.sqrt(dr.maximum(dr.fma(self.curvature * t, bent, 1.0), 0.0))
-        return self.start + t * bent / (1.0 + root)
+    def slope(self, s: Float) -> Float:
+        """Slopes of the ray, relative to the surface there, at distances along the surface."""
+        sin, cos = dr.sincos(2.0 * self.half_rate * s)
+        return (self.sine * sin - self.cosine * cos) / (self.sine * cos + self.cosine * sin)
 
 
 def tilt(curvature: Vector3f, step: Vector2f) -> Vector2f:
@@ -136,11 +140,10 @@ def tilt(curvature: Vector3f, step: Vector2f) -> Vector2f:
 
 @dataclass
 class ArcState:
-    """State of rays: the block's traversal, and the distances along the surface and the ray."""
+    """State of rays: the block's traversal, and the distance along the surface."""
 
     block: TraversalState
     s: Float
-    t: Float
 
 
 def trace_arcs(
@@ -166,31 +169,25 @@ def trace_arcs(
         mi.Point3f(x - 0.5, (y - 0.5) * aspect, arc.start), mi.Vector3f(arc.azimuth.x, arc.azimuth.y, 0.0)
     )
     block, constants = start_traversal(heightfield, ray, mi.Bool(active), mi.Bool(False))
-    state = ArcState(block, mi.Float(0.0), mi.Float(0.0))
-    # The largest factor by which curvature grows towards the bottom of the shell.
-    depth = -heightfield.bottom
-    growth = dr.rcp(1.0 - dr.maximum(arc.curvature, 0.0) * depth) ** 3
-    state = _follow(heightfield, state, constants, arc, 0.125 * growth * dr.abs(arc.curvature))
+    state = _follow(heightfield, ArcState(block, mi.Float(0.0)), constants, arc)
     return _meet(heightfield, state, constants, arc, active)
 
 
 @dr.syntax
-def _follow(
-    heightfield: HeightField, state: ArcState, constants: RayConstants, arc: Arc, sag: Float
-) -> ArcState:
-    while dr.hint(state.block.searching, exclude=[heightfield, constants, arc, sag]):
-        state = _step(heightfield, state, constants, arc, sag)
+def _follow(heightfield: HeightField, state: ArcState, constants: RayConstants, arc: Arc) -> ArcState:
+    while dr.hint(state.block.searching, exclude=[heightfield, constants, arc]):
+        state = _step(heightfield, state, constants, arc)
     return state
 
 
 @dataclass(frozen=True)
 class _Chord:
-    """The part of a ray within a block: the length `end` along the surface to the ray's `s` and `t`, and
+    """The part of a ray within a block: the length `end` along the surface to the ray's `s` and `z`, and
     heights above the block's plane."""
 
     end: Float
     s: Float
-    t: Float
+    z: Float
     here: Float
     there: Float
     across: Float
@@ -202,15 +199,15 @@ class _Chord:
         end = dr.maximum(dr.minimum(block.to_x, block.to_y), 0.0)
         s = dr.minimum(state.s + end, arc.end)
         end = dr.maximum(s - state.s, 0.0)
-        t = dr.select(s >= arc.end, arc.last, arc.distance(s))
+        z = arc.height(s)
         node, x, y = block.node, block.x, block.y
         here = state.block.z - dr.fma(x, node.y, dr.fma(y, node.z, node.x))
         x, y = dr.fma(end, constants.x, x), dr.fma(end, constants.y, y)
-        there = arc.height(t) - dr.fma(x, node.y, dr.fma(y, node.z, node.x))
+        there = z - dr.fma(x, node.y, dr.fma(y, node.z, node.x))
         across = block.x + block.y - 1.0
         diagonal = across * constants.over_both
-        at = dr.lerp(here, there, diagonal / dr.maximum(end, 1e-12))
-        return cls(end, s, t, here, there, across, diagonal, at)
+        at = dr.fma(there - here, diagonal, here * end)
+        return cls(end, s, z, here, there, across, diagonal, at)
 
     @property
     def crosses(self) -> Mask:
@@ -218,21 +215,18 @@ class _Chord:
         return (self.diagonal > 0) & (self.diagonal < self.end)
 
 
-def _step(
-    heightfield: HeightField, state: ArcState, constants: RayConstants, arc: Arc, sag: Float
-) -> ArcState:
+def _step(heightfield: HeightField, state: ArcState, constants: RayConstants, arc: Arc) -> ArcState:
     """Test one block: skip it, descend one level, or end."""
     block = Block.of(heightfield, state.block, constants)
     chord = _Chord.of(block, state, constants, arc)
     fold = dr.maximum(dr.fma(chord.end, constants.both, chord.across), 0.0) * block.node.w
-    steep = 1.0 + dr.abs(block.node.y) / heightfield.cell[0] + dr.abs(block.node.z) / heightfield.cell[1]
-    margin = dr.select(block.leaf, 0.0, sag * steep * dr.square(chord.t - state.t))
-    free = (chord.there - fold > margin) & (block.leaf | (chord.here > margin))
-    free &= ~(chord.crosses & (chord.at_diagonal <= 0))
+    here, there = chord.here, chord.there - fold
+    rest = here + there - 4.0 * arc.bend * dr.square(chord.end)
+    clear = (here > 0) & ((rest > 0) | (rest * rest < 4.0 * here * there))
+    free = (there > 0) & (block.leaf | clear) & ~(chord.crosses & (chord.at_diagonal <= 0))
     state.block.hit |= state.block.searching & block.leaf & ~free
     block.leave(heightfield, state.block, constants, dr.select(free, chord.end, 0.0), free)
-    state.s, state.t = dr.select(free, chord.s, state.s), dr.select(free, chord.t, state.t)
-    state.block.z = arc.height(state.t)
+    state.s, state.block.z = dr.select(free, chord.s, state.s), dr.select(free, chord.z, state.block.z)
     state.block.searching &= ~state.block.hit & ~(free & (state.s >= arc.end))
     return state
 
@@ -253,4 +247,4 @@ def _meet(
     share = dr.clip(here / (here - there), 0.0, 1.0)
     hit = active & (state.block.hit | arc.cut)
     share = dr.select(state.block.hit, share, 0.0)
-    return hit, dr.fma(share, chord.end, state.s), dr.lerp(state.block.z, arc.height(chord.t), share)
+    return hit, dr.fma(share, chord.end, state.s), dr.lerp(state.block.z, chord.z, share)

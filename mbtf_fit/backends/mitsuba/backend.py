@@ -20,7 +20,7 @@ from mbtf_fit.backends.mitsuba.textures import Textures
 from mbtf_fit.ops import Backend, Operation
 from mbtf_fit.ops.operation import input_sizes
 from mbtf_gen.engine.types import Float
-from mbtf_gen.tile.tracers.heightfield import HeightField
+from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
 Arithmetic = Literal["unrolled", "cooperative", "half"]
 Numbers = list[Float]
@@ -46,7 +46,7 @@ class Loader:
     arithmetic: Arithmetic
     sizes: Mapping[str, int]
     textures: dict[str, Textures] = field(default_factory=dict)
-    heightfields: dict[str, HeightField] = field(default_factory=dict)
+    heightfields: dict[str, HeightfieldGeometry] = field(default_factory=dict)
 
     @property
     def lattice(self) -> Lattice:

@@ -22,6 +22,7 @@ from mbtf_fit.backends.mitsuba.curvature import curvature, in_axes, with_normal_
 from mbtf_fit.backends.mitsuba.evaluator import Evaluator
 from mbtf_fit.backends.mitsuba.lobes import LobeTextures, Mixture, fit_lobes
 from mbtf_fit.backends.mitsuba.names import BSDF_NAME, footprints_provided, refuse_unknown
+from mbtf_fit.backends.mitsuba.partials import FootprintRequest, uv_partials
 from mbtf_fit.backends.mitsuba.shade import DirectLight
 from mbtf_fit.backends.mitsuba.shell import ShellHit, clamped, tilted
 from mbtf_fit.backends.mitsuba.stored_material import StoredMaterial, read_material
@@ -165,7 +166,7 @@ class MbtfBSDF(mi.BSDF):
         self.uv_scale = self._pair(props, "uv_scale")
         self.sigma_given = "sigma" in props
         self.sigma = self._positive(props, "sigma", stored.lattice.sigma_range[0])
-        self.folder = folder
+        self.folder, self.request = folder, FootprintRequest()
         super().__init__(props)
         known = mi.BSDFFlags
         self.m_flags = known.GlossyReflection | known.FrontSide | known.SpatiallyVarying | known.Anisotropic
@@ -215,8 +216,9 @@ class MbtfBSDF(mi.BSDF):
             )
         return value
 
-    def _warn_once(self) -> None:
-        if footprints_provided.get() or self.sigma_given or self.folder in _warned:
+    def _warn_once(self, si: SurfaceInteraction3f) -> None:
+        provided = footprints_provided.get() or hasattr(si, "footprint")
+        if provided or self.sigma_given or self.folder in _warned:
             return
         _warned.add(self.folder)
         _log.warning(
@@ -227,7 +229,7 @@ class MbtfBSDF(mi.BSDF):
 
     def footprint(self, si: SurfaceInteraction3f) -> Float:
         """σ at hits in tile widths, from the area of a pixel on the surface."""
-        dx, dy = si.duv_dx, si.duv_dy
+        dx, dy = uv_partials(si)
         area = dr.abs(dx.x * dy.y - dx.y * dy.x) * self.uv_scale.x * self.uv_scale.y
         return dr.select(area > 0, pixel_sigma(area), self.sigma)
 
@@ -236,7 +238,7 @@ class MbtfBSDF(mi.BSDF):
         return mi.Point2f(self.uv_scale.x * si.uv.x, 1.0 - self.uv_scale.y * si.uv.y / self.lattice.aspect)
 
     def _view(self, si: SurfaceInteraction3f) -> View:
-        self._warn_once()
+        self._warn_once(si)
         frame, u = Frame.at(si, self.two_sided, self.uv_scale), self.uv(si)
         level = self.evaluator.level(self.footprint(si))
         wi = frame.to_tile(si.wi)
@@ -309,6 +311,9 @@ class MbtfBSDF(mi.BSDF):
         callback.put("sigma", self.sigma, mi.ParamFlags.NonDifferentiable)
         for name, textures in self.evaluator.textures.items():
             callback.put(name.replace(".", "_"), textures.buffer, mi.ParamFlags.Differentiable)
+        if hasattr(mi.Texture, "filtered"):
+            # Found by the scene, which then computes footprints.
+            callback.put("footprint", self.request, mi.ParamFlags.NonDifferentiable)
 
     def to_string(self) -> str:
         """Text that Mitsuba prints."""
@@ -380,7 +385,7 @@ class View:
             return value if hit is None else value * hit.share
         values = evaluator.stage1(self.u, self.level, viewer, hit.values)
         least = self.bsdf.min_cos
-        visible = hit.visibility(wo)
+        visible = hit.visibility(wo, least)
         lit = DirectLight(visible, wo, dr.maximum(wo.z, least), least, hit.flat)
         curved = hit.light_cosine(wo, least, visible)
         cosine *= dr.select(hit.flat, dr.maximum(wo.z, 0.0), curved)

@@ -14,7 +14,7 @@ from mbtf_fit.backends.mitsuba.backend import MITSUBA, Loader, Numbers, Step
 from mbtf_fit.backends.mitsuba.shell import Shell, displaced
 from mbtf_fit.material.format import WEIGHTS_NAME
 from mbtf_gen.engine.types import Float, UInt32
-from mbtf_gen.tile.tracers.heightfield import HeightField
+from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
 
 @MITSUBA.implements(ops.Lookup)
@@ -96,7 +96,7 @@ def shell_of(op: ops.Trace, loader: Loader) -> Shell:
     if heights.size == 0 or heights.max() > 0:
         fault = "is empty" if heights.size == 0 else "has heights above the reference plane"
         raise InputError(f"its tensor '{op.heights}' {fault}", where=loader.stored.folder / WEIGHTS_NAME)
-    known[op.heights] = HeightField.of(heights.astype(np.float64), aspect, 1.0, two_sided=False)
+    known[op.heights] = HeightfieldGeometry.of(heights.astype(np.float64), aspect, 1.0, two_sided=False)
     return Shell(op, known[op.heights], aspect)
 
 

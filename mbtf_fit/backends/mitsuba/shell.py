@@ -14,9 +14,8 @@ import mitsuba as mi
 
 from mbtf_fit.backends.mitsuba.arcs import Arc, tilt, trace_arcs
 from mbtf_fit.ops import Trace
-from mbtf_gen.engine.types import Float, Mask, Point2f, Vector2f, Vector3f
-from mbtf_gen.tile.tracers.heightfield import HeightField
-from mbtf_gen.tile.tracers.heightfield_tracer import closest_height
+from mbtf_gen.engine.types import Float, Mask, Point2f, Ray3f, Vector2f, Vector3f
+from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry, closest_height
 
 # Largest depth of a shell in radii of curvature: sharper edges are traced as if they were that round.
 DEEPEST = 0.5
@@ -64,21 +63,20 @@ class ShellHit:
         share = sum(curved for curved, _ in visible) / len(visible)
         return dr.select(omega_i.z < least, dr.lerp(low, least, share), omega_i.z)
 
-    def visibility(self, omega_i: Vector3f) -> list[tuple[Float, Float]]:
+    def visibility(self, omega_i: Vector3f, least: Float) -> list[tuple[Float, Float]]:
         """Visibility of the light from the intersection of each place, 1 or 0, and what it would be over a
-        plane; light in the frame there."""
-        out, hits, depth = [], self.values[self.shell.op.hits], self.shell.depth
-        longest = float(self.shell.op.crossings)
+        plane, where the light's cosine is at least that of the data; light in the frame there."""
+        out, hits, shell = [], self.values[self.shell.op.hits], self.shell
+        longest = shell.op.crossings
         for k, height in enumerate(self.heights):
             # Off the surface by more than the rounding of its height.
-            start = dr.fma(_CLEARANCE, depth, height)
+            start = dr.fma(_CLEARANCE, shell.depth, height)
             at = mi.Point2f(*hits[2 * k : 2 * k + 2])
-            pair = []
-            for curvature in (self.curvature, mi.Vector3f(0.0)):
-                arc = Arc.of(omega_i, curvature, depth, longest, start)
-                found, *_ = trace_arcs(self.shell.heightfield, at, arc, self.shell.aspect, ~self.flat)
-                pair.append(dr.select(found, mi.Float(0.0), 1.0))
-            out.append((pair[0], pair[1]))
+            arc = Arc.of(omega_i, self.curvature, shell.depth, float(longest), start)
+            curved, *_ = trace_arcs(shell.heightfield, at, arc, shell.aspect, ~self.flat)
+            known = ~self.flat & (omega_i.z > least)
+            plane, *_ = shell.heightfield.occluded(shell.ray(at, start, omega_i), known, longest)
+            out.append((dr.select(curved, mi.Float(0.0), 1.0), dr.select(plane, mi.Float(0.0), 1.0)))
         return out
 
 
@@ -94,7 +92,7 @@ class Shell:
     """
 
     op: Trace
-    heightfield: HeightField
+    heightfield: HeightfieldGeometry
     aspect: float
 
     @property
@@ -116,9 +114,13 @@ class Shell:
 
     def flat_height(self, u: Sequence[Float], omega_o: Sequence[Float], active: Mask = True) -> Float:
         """Heights at which rays through points of a plane meet the heights."""
-        x, y = (c - dr.floor(c) for c in u)
-        ray = mi.Ray3f(mi.Point3f(x - 0.5, (y - 0.5) * self.aspect, 0.0), -mi.Vector3f(*omega_o))
+        ray = self.ray(u, mi.Float(0.0), -mi.Vector3f(*omega_o))
         return closest_height(self.heightfield, ray, self.op.crossings, active)
+
+    def ray(self, u: Sequence[Float], z: Float, d: Vector3f) -> Ray3f:
+        """Rays over a plane, from a height over points of it, as they are traced to the heights."""
+        x, y = (c - dr.floor(c) for c in u)
+        return mi.Ray3f(mi.Point3f(x - 0.5, (y - 0.5) * self.aspect, z), d)
 
     def meet(
         self,

@@ -205,10 +205,20 @@ def test_arcs_end_where_rays_over_a_sphere_do(kappa: float) -> None:
     c, up = np.linspace(0.05, 0.95, 19), np.zeros(19)
     d = mi.Vector3f(np.stack([np.sqrt(1 - c**2), up, -c]).astype(np.float32))
     arc = Arc.of(d, mi.Vector3f(kappa, 0.0, kappa), mi.Float(DEPTH), 64.0)
-    t = np.array(arc.last, np.float64)
+    # Where κ t² - 2 c t + 2 D - κ D² = 0, else at the top.
+    root = np.sqrt((c**2 - kappa * (2 * DEPTH - kappa * DEPTH**2)).astype(complex))
+    passes = root.imag != 0
+    t = np.where(passes, 2 * c / kappa, (2 * DEPTH - kappa * DEPTH**2) / (c + root.real))
+    np.testing.assert_array_equal(np.array(arc.passes), passes)
     expected = np.arctan2(kappa * t * np.sqrt(1 - c**2), 1 - kappa * t * c) / kappa
     np.testing.assert_allclose(np.array(arc.end), expected, rtol=1e-4)
-    np.testing.assert_allclose(np.array(arc.distance(arc.end)), t, rtol=1e-4)
+    for share in (1e-3, 0.5, 1.0):
+        along, across = 1 / kappa - share * t * c, share * t * np.sqrt(1 - c**2)
+        place = np.arctan2(kappa * across, kappa * along) / kappa
+        z = np.sign(kappa) * np.hypot(along, across) - 1 / kappa
+        np.testing.assert_allclose(
+            np.array(arc.height(mi.Float(place.astype(np.float32)))), z, rtol=1e-4, atol=1e-6
+        )
 
 
 def test_sharp_edges_are_rounded(tmp_path: Path) -> None:
