@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from mbtf_core.app.options import Quality
 from mbtf_core.color import ALBEDO_EXPOSURE
-from mbtf_core.config.settings import Settings, build, distinct, explicit_options, resolve
+from mbtf_core.config.settings import Settings, build, deep_merge, distinct, explicit_options, resolve
 from mbtf_core.config.yaml_file import dump_yaml, line_of, read_yaml
 from mbtf_core.errors import InputError
 from mbtf_core.paths import named_file, split_url
@@ -302,6 +302,13 @@ def preset_recipe(
     from mbtf_gen.job import Job, limit_resolution
 
     return recipe.model_copy(update={"generate": limit_resolution(Job.load(recipe.generate)).config})
+
+
+def with_training(recipe: Recipe, **options: Any) -> Recipe:
+    """The recipe with training options of all its fits."""
+    changes = {"training": options}
+    fits = {n: FitConfig.model_validate(deep_merge(f.model_dump(), changes)) for n, f in recipe.fit.items()}
+    return recipe.model_copy(update={"fit": fits})
 
 
 def write_recipe(recipe: Recipe, folder: Path, *, overwrite: bool = False) -> None:

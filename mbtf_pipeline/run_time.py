@@ -16,16 +16,14 @@ from pathlib import Path
 from types import MappingProxyType
 
 from mbtf_core.app.options import Quality
-from mbtf_core.config.settings import deep_merge
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.files.atomic import data_sha256, read_json, write_json
 from mbtf_core.files.folders import check_space, free_space, owned
 from mbtf_core.forecast import is_long
 from mbtf_core.units import clock, expectation
-from mbtf_fit.config import FitConfig
 from mbtf_gen.job import Job, planned_work, query_work, split_queries
 from mbtf_pipeline.compare.image_files import scenes
-from mbtf_pipeline.recipe import Recipe, preset_recipe
+from mbtf_pipeline.recipe import Recipe, preset_recipe, with_training
 from mbtf_pipeline.run import COMPARE_STAGE, data_sets, fit_stage, layout_of, survey
 from mbtf_pipeline.stages import RUN, write_run_record
 
@@ -241,7 +239,7 @@ class TimedRun:
         """The recipe with the split's preset and training time."""
         split = self.split
         recipe = preset_recipe(self._file, split.quality, self._assignments, split.training)
-        return _trained(recipe, split.training)
+        return with_training(recipe, time=split.training, steps=None)
 
     def generated(self, recipe: Recipe) -> Recipe:
         """The recipe with the training time that is left now that the data are generated."""
@@ -252,7 +250,7 @@ class TimedRun:
             if late > 1.0:
                 self._progress(f"time: generating took long; the run will be about {clock(late)} late")
             self._store(replace(self.split, training=each, final=True))
-        return _trained(recipe, self.split.training)
+        return with_training(recipe, time=self.split.training, steps=None)
 
     def _left(self) -> float:
         return (1.0 - _RESERVE) * self._seconds - (time.perf_counter() - self._began)
@@ -290,15 +288,6 @@ class TimedRun:
         # `paper` counts steps; its training, and that of a shortened draft, may lose half.
         least = expected.training / fits
         return Split(quality, each, least if 0 < least <= each else 0.5 * each, round(after, 1))
-
-
-def _trained(recipe: Recipe, seconds: float) -> Recipe:
-    """The recipe with a training time of each fit."""
-    time = {"training": {"time": seconds, "steps": None}}
-    fits = {
-        name: FitConfig.model_validate(deep_merge(fit.model_dump(), time)) for name, fit in recipe.fit.items()
-    }
-    return recipe.model_copy(update={"fit": fits})
 
 
 def round_down(count: float) -> int:

@@ -134,8 +134,7 @@ def cost(
         lines[-1] += f"; not measured for lack of time: {len(study.skipped)}"
     lines += [f"failed: {text}" for text in study.failed]
     lines += [row["line"] for row in rows]
-    lines += [study.asked] if study.asked else []
-    lines += [study.more] if study.more else []
+    lines += filter(None, [study.asked, study.more])
     lines += [f"warning: {busy}"] if busy else []
     lines += [f"  {m.seconds.value:.0f} s: {m.command}" for m in front]
     console.report(data, "\n".join(lines))

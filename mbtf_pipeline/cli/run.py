@@ -114,28 +114,26 @@ def run(
         _refuse(flags, ("quick",), "a recipe of one material", "use --quality draft")
         folder = output or loaded.folder
         from mbtf_core.config.settings import explicit_options
-        from mbtf_pipeline.cost.forecast import has_error
-        from mbtf_pipeline.recipe import is_single
+        from mbtf_pipeline.recipe import is_single, preset_recipe, with_training
+        from mbtf_pipeline.run_time import TimedRun, forecast_left
 
         # The file may be another one when the run has ended.
         single = is_single(explicit_options(recipe, own)["fit"])
         if time is None:
-            from mbtf_pipeline.recipe import preset_recipe
-            from mbtf_pipeline.run_time import forecast_left
-
-            loaded, generated = has_error(preset_recipe(recipe, quality, own), error), None
+            loaded, generated = preset_recipe(recipe, quality, own), None
             draft = preset_recipe(recipe, "draft", own)
             if not dry_run and (expected := forecast_left(loaded, folder, draft)) is not None:
                 console.note(expected)
         else:
             from mbtf_core.units import asked_duration
-            from mbtf_pipeline.run_time import TimedRun
 
             seconds = asked_duration(time, "--time")
             timed = TimedRun(
                 recipe, seconds, folder, command, console.note, quality, own, began, dry_run=dry_run
             )
-            loaded, generated, quality = has_error(timed.recipe, error), timed.generated, timed.split.quality
+            loaded, generated, quality = timed.recipe, timed.generated, timed.split.quality
+        if error is not None:
+            loaded = with_training(loaded, error=error)
         if dry_run:
             _forecast(loaded, folder, console)
             return

@@ -109,10 +109,7 @@ class Evidence:
         found, least = curve.time_of(error), self.overhead
         time = Interval(found.value + least, found.low + least, found.high + least)
         if self.farthest < time.value < math.inf:
-            return (
-                f"error {error:g}: takes more than {clock(self.farthest)}, which is as far as these runs "
-                "forecast; a longer --time forecasts further"
-            )
+            return f"error {error:g}: takes more than {clock(self.farthest)}, where the forecast ends"
         return expected_seconds(error, time, curve.limit, _LIMITS)
 
 

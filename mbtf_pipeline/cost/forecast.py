@@ -14,17 +14,6 @@ from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.run import DataSet, data_sets, layout_of, survey
 
 
-def has_error(recipe: Recipe, error: float | None) -> Recipe:
-    """The recipe with fits that stop at an error; None changes nothing."""
-    if error is None:
-        return recipe
-    fits = {}
-    for name, fit in recipe.fit.items():
-        data = fit.model_dump()
-        fits[name] = FitConfig.model_validate({**data, "training": {**data["training"], "error": error}})
-    return recipe.model_copy(update={"fit": fits})
-
-
 def forecast_errors(recipe: Recipe, folder: Path, note: Callable[[str], None]) -> dict[str, dict[str, Any]]:
     """Forecast the error of each fit of a run.
 
@@ -47,7 +36,6 @@ def forecast_errors(recipe: Recipe, folder: Path, note: Callable[[str], None]) -
     stale = survey(recipe, folder)
     data_of: dict[str, DataSet] = {data.config.queries.layout: data for data in data_sets(recipe)}
     found: dict[str, dict[str, Any]] = {}
-    # By data set, as the reason is the same for all its fits.
     missing: dict[str, str] = {}
     for name, fit in recipe.fit.items():
         data = data_of[layout_of(fit)]
@@ -66,8 +54,7 @@ def _no_forecast(fit: FitConfig, path: Path) -> str:
     text = f"no forecast of the error: {path} has no data of these options yet"
     if not is_dataset(path):
         return text
-    training = fit.training
-    time = None if training.steps else format_duration(training.time.seconds)
-    budget = {"steps": training.steps, "time": time, "error": training.error}
-    command = command_line("mbtf-fit", path, model=fit.model, **budget, dry_run=True)
+    steps, time, error = fit.training.steps, fit.training.time.seconds, fit.training.error
+    budget = {"steps": steps} if steps else {"time": format_duration(time)}
+    command = command_line("mbtf-fit", path, model=fit.model, **budget, error=error, dry_run=True)
     return f"{text}; of those that it has: {command}"

@@ -19,8 +19,8 @@ from mbtf_pipeline import run as runs
 from mbtf_pipeline import run_time as module
 from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.cost import forecast
-from mbtf_pipeline.cost.forecast import forecast_errors, has_error
-from mbtf_pipeline.recipe import load_recipe, preset_recipe
+from mbtf_pipeline.cost.forecast import forecast_errors
+from mbtf_pipeline.recipe import load_recipe, preset_recipe, with_training
 from mbtf_pipeline.run_time import RunForecaster, TimedRun, forecast_left
 
 FILE = ROOT / "pipelines" / "quickstart.yaml"
@@ -186,7 +186,7 @@ def test_a_draft_is_suggested_where_its_steps_take_less_on_slow_machines(fake: M
 def test_without_data_one_command_forecasts_the_errors_of_all_fits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recipe, shards = has_error(load_recipe(FILE), 0.2), tmp_path / "shards"
+    recipe, shards = with_training(load_recipe(FILE), error=0.2), tmp_path / "shards"
     texts = {found["text"] for found in forecast_errors(recipe, tmp_path, lambda note: None).values()}
     assert texts == {f"no forecast of the error: {shards} has no data of these options yet"}
     # Those of another preset.

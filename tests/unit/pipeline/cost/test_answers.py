@@ -54,7 +54,7 @@ def test_a_study_forecasts_times_and_errors() -> None:
     assert found.time_of(law(200.0)).startswith(f"error {law(200.0):g}: about ")
     assert "not reachable with this network, however many queries" in found.time_of(0.01)
     # The work of the longest run takes 313 s.
-    assert "takes more than 20:59, which is as far as" in found.time_of(law(1900.0))
+    assert "takes more than 20:59, where the forecast ends" in found.time_of(law(1900.0))
     assert found.error_after(1300.0) is None
 
 
