@@ -179,7 +179,7 @@ def parse_sequence(text: str, where: str) -> list[str]:
     return [name for name, _, count in found for _ in range(count)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Weave:
     """One tile of woven cloth.
 
