@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-import struct
-from array import array
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
@@ -19,33 +18,30 @@ from mbtf_core.meshes.mtl import as_text
 from mbtf_core.meshes.numbers import parse, read_bytes
 from mbtf_core.meshes.polygons import UNCUT, triangulate
 
-# Codes of the module struct.
-_OLD = {"char": "b", "uchar": "B", "short": "h", "ushort": "H", "int": "i", "uint": "I"}
 _TYPES = {
-    **_OLD,
-    **{f"{'u' * code.isupper()}int{8 * struct.calcsize(code)}": code for code in _OLD.values()},
-    **{"float": "f", "float32": "f", "double": "d", "float64": "d"},
+    **{name: name for name in ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")},
+    "char": "int8",
+    "uchar": "uint8",
+    "short": "int16",
+    "ushort": "uint16",
+    "int": "int32",
+    "uint": "uint32",
+    "float": "float32",
+    "double": "float64",
 }
-# Byte orders; a text becomes 64-bit floats of this machine.
-_FORMATS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+_FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MOST_HEADER = 1 << 20
+_SHORT = "ends before its last element: check that the file is complete"
 
 
 @dataclass(frozen=True)
 class _Property:
-    """A property of an element.
-
-    Attributes
-    ----------
-    kind : code of its type in the header
-    stored, length : formats of its numbers, and of the length of a list, in the body; empty for a single
-        number
-    """
+    """A property of an element."""
 
     name: str
+    # NumPy's names of its type, and of the type of the length of a list; None for a single number.
     kind: str
-    stored: str
-    length: str = ""
+    length: str | None = None
 
 
 @dataclass
@@ -66,7 +62,7 @@ class _Element:
 
 @dataclass(frozen=True)
 class _Elements:
-    """Content of a PLY file; `rest` is the number of bytes after the last element."""
+    """Content of a PLY file; `rest` is bytes, or numbers of a text, after the last element."""
 
     elements: dict[str, _Element]
     comments: list[str]
@@ -79,27 +75,16 @@ def _read_elements(path: Path) -> _Elements:
     end = re.search(rb"(?:^|[\r\n])end_header[ \t]*(\r\n|\n|\r)", data[:_MOST_HEADER])
     if not data.startswith(b"ply") or end is None:
         raise InputError("is not a PLY file: its header is damaged", where=path)
-    is_text, elements, comments = _header(as_text(data[: end.start()]), path)
-    body = data[end.end() :]
-    if is_text:
-        numbers = parse(body, np.float64)
-        if numbers is None:
-            raise InputError("has words that are no numbers after its header", where=path)
-        body = numbers.tobytes()
-    position, hint = 0, "check that the file is complete"
-    try:
-        for element in elements:
-            position = _read_rows(element, body, position)
-    except struct.error:
-        raise InputError("ends before its last element", where=path, hint=hint) from None
-    except InputError as error:
-        raise InputError(error.what, where=path, hint=hint) from None
-    return _Elements({element.name: element for element in elements}, comments, len(body) - position)
+    order, elements, comments = _header(as_text(data[: end.start()]), path)
+    body = _Body(data[end.end() :], order, path)
+    for element in elements:
+        body.read(element)
+    return _Elements({element.name: element for element in elements}, comments, body.rest)
 
 
-def _header(text: str, path: Path) -> tuple[bool, list[_Element], list[str]]:
-    """Whether the body is a text, elements without rows, and comments."""
-    order, elements, comments = "", list[_Element](), list[str]()
+def _header(text: str, path: Path) -> tuple[Literal["", "<", ">"], list[_Element], list[str]]:
+    """Byte order, elements without rows, and comments."""
+    order, elements, comments = None, list[_Element](), list[str]()
     for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1):
         match line.split():
             case ["comment" | "obj_info", *_]:
@@ -108,70 +93,131 @@ def _header(text: str, path: Path) -> tuple[bool, list[_Element], list[str]]:
                 order = _FORMATS[name]
             case ["element", name, count] if count.isdecimal():
                 elements.append(_Element(name, int(count)))
-            case ["property", *length, kind, name] if (
-                order
-                and elements
-                and kind in _TYPES
-                and (not length or (length[:-1] == ["list"] and _TYPES.get(length[1], "f") not in "fd"))
+            case ["property", "list", length, kind, name] if (
+                elements and kind in _TYPES and _TYPES.get(length, "float")[0] != "f"
             ):
-                code, *counted = (_TYPES[one] for one in (kind, *length[1:]))
-                stored = (order + ("d" if order == "=" else one) for one in (code, *counted))
-                elements[-1].properties.append(_Property(name, code, *stored))
+                elements[-1].properties.append(_Property(name, _TYPES[kind], _TYPES[length]))
+            case ["property", kind, name] if elements and kind in _TYPES:
+                elements[-1].properties.append(_Property(name, _TYPES[kind]))
             case [] | ["ply"]:
                 pass
             case _:
                 raise InputError(f"'{line[:60]}' is no line of a PLY header", where=f"{path}, line {number}")
-    if not order:
+    if order is None:
         raise InputError("its header names none of the formats of PLY", where=path)
     for names in ([e.name for e in elements], *([p.name for p in e.properties] for e in elements)):
         if len(set(names)) < len(names):
             raise InputError("its header names an element or a property twice", where=path)
-    return order == "=", elements, comments
+    return order, elements, comments  # type: ignore[return-value]
 
 
-def _read_rows(element: _Element, body: bytes, position: int) -> int:
-    """Read the rows of an element from a byte on; returns where they end.
+class _Body:
+    """What follows the header, in cells: numbers of a text, or bytes."""
 
-    Raises
-    ------
-    struct.error : the body ends before
-    InputError : there are fewer rows, or the length of a list cannot be
-    """
-    least = sum(struct.calcsize(one.length or one.stored) for one in element.properties)
-    if element.count * least > len(body) - position:
-        raise InputError(f"claims {element.count:,} rows of '{element.name}', more than are there")
-    if not element.count or not least:
-        return position
-    if not any(one.length for one in element.properties):
-        row = np.dtype([(one.name, one.stored) for one in element.properties])
-        rows = np.frombuffer(body, row, element.count, position)
-        element.columns = {name: rows[name].astype(np.float64) for name in row.names or ()}
-        return position + rows.nbytes
-    found = {one.name: (array("d"), array("q")) for one in element.properties}
-    layout = [
-        (*found[one.name], one.length, struct.calcsize(one.length), *one.stored, struct.calcsize(one.stored))
-        for one in element.properties
-    ]
-    unpack, end = struct.unpack_from, len(body)
-    for _ in range(element.count):
-        for numbers, lengths, counted, skipped, order, code, size in layout:
-            length = 1
-            if counted:
-                (length,) = unpack(counted, body, position)
-                if not (0 <= length <= end and length == int(length)):
-                    raise InputError(f"has a list of {length:g} numbers")
-                length = int(length)
-                position += skipped
-            numbers.extend(unpack(f"{order}{length}{code}", body, position))
-            lengths.append(length)
-            position += length * size
-    for one in element.properties:
-        values, sizes = (np.array(part) for part in found[one.name])
-        if one.length:
-            element.lists[one.name] = values, sizes
-        else:
-            element.columns[one.name] = values
-    return position
+    def __init__(self, data: bytes, order: Literal["", "<", ">"], path: Path) -> None:
+        self.order, self.path, self.position = order, path, 0
+        cells = np.frombuffer(data, np.uint8) if order else parse(data, np.float64)
+        if cells is None:
+            raise InputError("has words that are no numbers after its header", where=path)
+        self.cells: NDArray[Any] = cells
+
+    @property
+    def rest(self) -> int:
+        """Cells that are left."""
+        return len(self.cells) - self.position
+
+    def read(self, element: _Element) -> None:
+        """Read the rows of an element."""
+        least = sum(self._size(one.length or one.kind) for one in element.properties)
+        if element.count * least > self.rest:
+            raise InputError(
+                f"claims {element.count:,} rows of '{element.name}', more than are there",
+                where=self.path,
+                hint="check that the file is complete",
+            )
+        if element.count and least and not self._read_alike(element):
+            self._read_ragged(element)
+
+    def _read_alike(self, element: _Element) -> bool:
+        """Read rows at once, if all are as long as the first one."""
+        ranges, width = [], 0
+        for one in element.properties:
+            length = None
+            if one.length is not None:
+                length = self._length(self.position + width, one.length)
+                width += self._size(one.length)
+            end = width + self._size(one.kind) * (1 if length is None else length)
+            ranges.append((one, length, width, end))
+            width = end
+        if element.count * width > self.rest:
+            return False
+        end = self.position + element.count * width
+        rows = self.cells[self.position : end].reshape(element.count, width)
+        for one, length, begin, _ in ranges:
+            if one.length is not None:
+                lengths = self._decoded(rows[:, begin - self._size(one.length) : begin], one.length)
+                if not (lengths == length).all():
+                    return False
+        for one, length, begin, stop in ranges:
+            numbers = self._decoded(rows[:, begin:stop], one.kind)
+            if length is None:
+                element.columns[one.name] = numbers
+            else:
+                element.lists[one.name] = numbers, np.full(element.count, length)
+        self.position = end
+        return True
+
+    def _read_ragged(self, element: _Element) -> None:
+        """Read rows one by one."""
+        position = self.position
+        places = {one.name: (list[int](), list[int]()) for one in element.properties}
+        layout = [(*places[p.name], p.length, self._size(p.kind)) for p in element.properties]
+        sizes = {p.length: self._size(p.length) for p in element.properties if p.length is not None}
+        for _ in range(element.count):
+            for starts, lengths, kind, size in layout:
+                length = 1
+                if kind is not None:
+                    length = self._length(position, kind)
+                    position += sizes[kind]
+                starts.append(position)
+                lengths.append(length)
+                position += length * size
+        if position > len(self.cells):
+            raise InputError(_SHORT, where=self.path)
+        for one in element.properties:
+            first, counts = (np.array(numbers, np.int64) for numbers in places[one.name])
+            size = self._size(one.kind)
+            within = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+            cells = np.repeat(first, counts) + within * size
+            numbers = self._decoded(self.cells[cells[:, None] + np.arange(size)], one.kind)
+            if one.length is None:
+                element.columns[one.name] = numbers
+            else:
+                element.lists[one.name] = numbers, counts
+        self.position = position
+
+    def _size(self, kind: str) -> int:
+        """Cells of a number."""
+        return np.dtype(kind).itemsize if self.order else 1
+
+    def _decoded(self, cells: NDArray[Any], kind: str) -> F64:
+        """Numbers of rows of cells."""
+        if self.order != "":
+            stored = np.dtype(kind).newbyteorder(self.order)
+            cells = np.ascontiguousarray(cells).view(stored)
+        return cells.astype(np.float64).ravel()
+
+    def _length(self, position: int, kind: str) -> int:
+        """Length of the list that starts at a cell."""
+        size = self._size(kind)
+        if position + size > len(self.cells):
+            raise InputError(_SHORT, where=self.path)
+        if kind == "uint8" and self.order:
+            return int(self.cells[position])
+        length = float(self._decoded(self.cells[position : position + size], kind)[0])
+        if not (0 <= length <= self.rest and length == int(length)):
+            raise InputError(f"has a list of {length:g} numbers", where=self.path)
+        return int(length)
 
 
 _POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
@@ -180,7 +226,7 @@ _UV = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"), ("texture_s", "textur
 _CORNERS = ("vertex_indices", "vertex_index")
 _WEDGE, _IMAGE = "texcoord", "texnumber"
 # Largest number of integer colors.
-_MOST = {"B": 255.0, "H": 65535.0}
+_MOST = {"uint8": 255.0, "uint16": 65535.0}
 _TEXTURE = "TextureFile"
 
 
@@ -294,7 +340,7 @@ def _colors(vertex: _Element, face: _Element, number: I64, sizes: I64) -> F64 | 
         return None
     kind = element.kind(names[0])
     colors = _stacked(element, names)
-    if kind not in "fd":
+    if not kind.startswith("float"):
         colors = np.asarray(srgb_to_linear(colors / _MOST.get(kind, 255.0)), np.float64)
     return np.repeat(colors, sizes, axis=0) if of_face else colors[number]
 

@@ -24,10 +24,9 @@ from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.objective.noise import LEAST_BOUND
 from mbtf_fit.training.trainer import Trainer, TrainingProgress
 
-# Standard errors that make a difference significant. A single false highlight, which is how fits of gloss
-# overfit, makes a difference of one standard error, however bright it is. Its least share of the best error:
-# paired errors resolve differences that do not matter.
-_SIGNIFICANT, _LEAST = 1.5, 0.05
+# Standard errors that make a difference significant: the best of many states is compared. Its least share of
+# the best error: paired errors resolve differences that do not matter.
+_SIGNIFICANT, _LEAST = 3.0, 0.05
 # Bounds of the values that are compared.
 _TRIED = 4
 # Steps of the first state that may be kept, and how many there are until twice the steps.
@@ -89,21 +88,24 @@ def overfits(
 
 
 def lower_bound(trainer: Trainer, queries: ShardQueries) -> None:
-    """Divide the bound of learned values by the power of 4 with the smallest error of validation queries, if
-    that is smaller by a twentieth. The bound stays at least :data:`~mbtf_fit.objective.noise.LEAST_BOUND`."""
+    """Divide the bound of learned values by the least power of 4 whose validation error is within a twentieth
+    of the smallest. The bound stays at least :data:`~mbtf_fit.objective.noise.LEAST_BOUND`.
+
+    There is no test of significance: a single glint makes a difference of one standard error, however bright
+    it is, and bounds above the values of all validation queries make no difference.
+    """
     bounds = [trainer.model.number(name) for name in trainer.model.bounds]
-    if not bounds or len(queries) == 0:
+    first = float(bounds[0]) if bounds and len(queries) else 0.0
+    tried = [most for k in range(_TRIED) if (most := first / 4.0**k) >= LEAST_BOUND]
+    if len(tried) < 2:
         return
-    first, errors = float(bounds[0]), dict[float, float]()
-    for k in range(_TRIED):
-        most = first / 4.0**k
-        if k > 0 and most < LEAST_BOUND:
-            break
+    errors: list[float] = []
+    for most in tried:
         for bound in bounds:
             bound.fill_(most)
-        errors[most] = noise_free_mse(trainer.predict(queries), *queries.halves).value
-    best = min(errors, key=lambda most: errors[most])
-    chosen = best if errors[best] < (1.0 - _LEAST) * errors[first] else first
+        errors.append(noise_free_mse(trainer.predict(queries), *queries.halves).value)
+    good = min(errors) + _LEAST * abs(min(errors))
+    chosen = next(most for most, error in zip(tried, errors, strict=True) if error <= good)
     for bound in bounds:
         bound.fill_(chosen)
 
