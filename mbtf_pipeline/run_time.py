@@ -135,9 +135,9 @@ class RunForecaster:
         )
 
 
-def forecast_left(recipe: Recipe, folder: Path, draft: Recipe) -> str | None:
-    """Forecast of the stages that a run in a folder has yet to do, as a line with faster options: `draft` is
-    the recipe at that preset. None where they are short and small on any machine.
+def forecast_left(recipe: Recipe, folder: Path, draft: Callable[[], Recipe]) -> str | None:
+    """Forecast of the stages that a run in a folder has yet to do, as a line with faster options: `draft`
+    makes the recipe of that preset. None where they are short and small on any machine.
 
     Raises
     ------
@@ -151,8 +151,9 @@ def forecast_left(recipe: Recipe, folder: Path, draft: Recipe) -> str | None:
     check_space(folder, expected.bytes, hint)
     if not is_long(expected.seconds, expected.bytes):
         return None
-    expected, other = forecaster.of(recipe, stages), forecaster.of(draft)
-    training = max(other.training, other.min_steps * _SLOW_STEP * len(draft.fit))
+    shorter = draft()
+    expected, other = forecaster.of(recipe, stages), forecaster.of(shorter)
+    training = max(other.training, other.min_steps * _SLOW_STEP * len(shorter.fit))
     faster = ["--quality draft"] * (other.seconds - other.training + training < expected.seconds)
     faster += ["--time 2min"] * (expected.seconds > 120.0)
     return expected.describe() + (f"; faster: {', or '.join(faster)}" if faster else "")

@@ -121,7 +121,7 @@ def run(
         single = is_single(explicit_options(recipe, own)["fit"])
         if time is None:
             loaded, generated = preset_recipe(recipe, quality, own), None
-            draft = preset_recipe(recipe, "draft", own)
+            draft = partial(preset_recipe, recipe, "draft", own)
             if not dry_run and (expected := forecast_left(loaded, folder, draft)) is not None:
                 console.note(expected)
         else:

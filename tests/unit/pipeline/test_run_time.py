@@ -164,7 +164,7 @@ def test_a_run_states_its_cost_and_is_refused_if_the_disk_is_full(
     assert "--set" in hint
     assert not out.exists()
     with pytest.raises(InputError, match="holds no run"):
-        forecast_left(load_recipe(FILE), ROOT / "pipelines", load_recipe(FILE))
+        forecast_left(load_recipe(FILE), ROOT / "pipelines", lambda: load_recipe(FILE))
 
 
 def test_a_draft_is_suggested_where_its_steps_take_less_on_slow_machines(fake: Machine, one: Path) -> None:
@@ -174,7 +174,7 @@ def test_a_draft_is_suggested_where_its_steps_take_less_on_slow_machines(fake: M
         text = ONE.replace("neumip}", f"neumip, training: {{time: {seconds}s}}}}")
         one.write_text(text.replace("npy,", "npy, queries: {resolution: 64, train: 100/texel},"))
         recipe, draft = preset_recipe(one, None), preset_recipe(one, "draft")
-        return forecast_left(recipe, one.parent / "none", draft)
+        return forecast_left(recipe, one.parent / "none", lambda: draft)
 
     short, long = suggested(30), suggested(200)
     assert short is not None
