@@ -9,8 +9,6 @@ from support.published import LAYOUTS, contents, publish, small
 
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError
-from mbtf_gen.config.exchange import PublishConfig
-from mbtf_gen.publishing.publication import Publication
 
 
 @pytest.fixture
@@ -24,20 +22,6 @@ def test_the_same_command_gives_the_same_bytes(form: str, shards: Path, tmp_path
     pytest.importorskip("pyarrow")
     first, second = (publish(shards, tmp_path / name, form=form) for name in ("a", "b"))
     assert contents(first) == contents(second)
-
-
-def test_other_options_are_refused_and_replace(shards: Path, tmp_path: Path) -> None:
-    card = publish(shards, tmp_path / "card", form="parquet")
-    (card / "mine.txt").write_text("kept")
-    before = contents(card)
-    with pytest.raises(InputError, match=r"another configuration: license: CC0-1\.0 -> CC-BY-4\.0"):
-        publish(shards, card, form="parquet", license="CC-BY-4.0")
-    assert contents(card) == before
-    config = PublishConfig(license="CC-BY-4.0", form="npz")
-    Publication.prepare(shards, config).write(card, overwrite=True)
-    assert not list(card.rglob("*.parquet"))
-    assert (card / "mine.txt").read_text() == "kept"
-    assert "CC-BY-4.0" in (card / "README.md").read_text()
 
 
 def test_damage_is_found_before_anything_is_written(shards: Path, tmp_path: Path) -> None:

@@ -46,13 +46,6 @@ def folder(tmp_path: Path) -> Path:
     return out
 
 
-def test_commands_without_data_warn_about_the_scale(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    config = GeneratorConfig(material=str(folder), geometry=GeometrySection(height_scale=2.0))
-    Job.load(config).announce_briefly()
-    assert "times as steep as its slopes" in caplog.text
-    assert "warnings" not in caplog.text
-
-
 def test_the_warning_about_the_scale_states_the_slopes_that_it_leads_to(folder: Path) -> None:
     material = load_material(folder)
     agreed = slope_angles(material.at(material.normal_fit.scale).grid)[0]

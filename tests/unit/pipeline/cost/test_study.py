@@ -20,7 +20,7 @@ from mbtf_core.errors import InputError, PartialError
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result, packed, run_task
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.cost import measurement, plan, schedule
+from mbtf_pipeline.cost import plan, schedule
 from mbtf_pipeline.cost import study as module
 from mbtf_pipeline.cost.generator import GeneratorBenchmark, GeneratorConfiguration
 from mbtf_pipeline.cost.measurement import (
@@ -28,7 +28,7 @@ from mbtf_pipeline.cost.measurement import (
     Measurement,
     MeasurementFolder,
 )
-from mbtf_pipeline.cost.runs import GENERATOR, LEAST_SECONDS, MOST_SEEDS, Run, planned_runs
+from mbtf_pipeline.cost.runs import GENERATOR, LEAST_SECONDS, MOST_SEEDS, Run
 from mbtf_pipeline.cost.schedule import COMPILING, Measurements
 from mbtf_pipeline.recipe import load_recipe
 
@@ -89,20 +89,6 @@ def test_workers_measure_the_runs_of_one_process(monkeypatch: pytest.MonkeyPatch
         assert found.failed[runs[2].label] == "training diverged at step 7"
     assert groups[0] == groups[1]
     assert [len(group) for group in groups[0]] == [MOST_SEEDS, MOST_SEEDS, 0]
-
-
-def test_the_time_of_a_study_counts_its_test_set_once_and_the_generator() -> None:
-    found = Measurements(conditions(), MemoryStore(), Runner(), path_seconds=1e-3)  # type: ignore[arg-type]
-    runs = [run(2000, "short", 60.0), run(1000, "m", 40.0)]
-    each = [r.planned_seconds(1e-3) + found.overhead for r in runs]
-    fitting, spent = found.fitting(runs, 5.0, 1e9)
-    assert fitting == runs
-    assert spent == pytest.approx(5.0 + found.test_seconds + sum(each))
-    least = found.least_run_seconds(4, 5.0)
-    assert least is not None
-    first = planned_runs(0.0, 4, 1e-3)[0]
-    needed = 5.0 + found.test_seconds + first.planned_seconds(1e-3) + found.overhead
-    assert least == pytest.approx(needed + COMPILING * GENERATOR * (least - LEAST_SECONDS))
 
 
 def test_a_longer_study_has_time_for_a_longer_run() -> None:
@@ -215,21 +201,6 @@ def test_a_plan_writes_nothing_and_has_fewer_runs_beside_other_work(
     assert none.startswith("complete runs to measure: none; with 25% of the processors free, no complete run")
     assert "expected" not in none
     assert not (tmp_path / "study").exists()
-
-
-def test_a_study_expects_slower_runs_where_other_work_left_less(
-    fake: FakeRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As its dry run does, before a run is measured."""
-    recipe, said = load_recipe(RECIPE, []), list[str]()
-    for share in (1.0, 0.25):
-        monkeypatch.setattr(measurement, "processor_share", lambda share=share: share)
-        module.run_study(
-            recipe, tmp_path / f"{share}", seconds=190.0, progress=lambda spent, note: said.append(note)
-        )
-    first = [note for note in said if note.startswith("run, neumip, short, about")]
-    # 60 s, and 7 s or 28 s besides.
-    assert [note.rpartition(" ")[2] for note in first] == ["1:07", "1:28"]
 
 
 def test_other_seeds_and_materials_are_not_mixed(fake: FakeRuns, tmp_path: Path) -> None:
