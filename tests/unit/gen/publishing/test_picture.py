@@ -11,7 +11,7 @@ from support.fit_data import constant, write_data
 from support.published import LAYOUTS, small
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_gen.publishing.picture import brdf_image, tile_images, write_picture
+from mbtf_gen.publishing.picture import brdf_image, contrasted, tile_images, write_picture
 
 
 def test_images_have_v_and_the_light_where_they_belong(tmp_path: Path) -> None:
@@ -54,3 +54,12 @@ def test_every_layout_has_its_picture(layout: str, tmp_path: Path, draws: None) 
     first = write_picture(*shown, tmp_path / "a.png")
     assert write_picture(*shown, tmp_path / "b.png").sha256 == first.sha256
     assert np.asarray(Image.open(tmp_path / "a.png").convert("L"), np.float64).std() > 5
+
+
+def test_contrast_keeps_colors_and_gaps() -> None:
+    image = np.array([[[0.2, 0.1, 0.1], [0.4, 0.2, 0.2]], [[0.0, 0.0, 0.0], [np.nan, np.nan, np.nan]]])
+    found = contrasted(image)
+    assert found[0, 1, 0] / found[0, 0, 0] > 2.5
+    np.testing.assert_allclose(found[0, :, 1] / found[0, :, 0], 0.5)
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(image))
+    assert not found[1, 0].any()

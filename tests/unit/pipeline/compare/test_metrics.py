@@ -31,6 +31,16 @@ def noisy(truth: np.ndarray, noise: float, seed: int) -> tuple[np.ndarray, np.nd
     return a, b
 
 
+def test_noise_of_the_reference_does_not_bias_the_error() -> None:
+    truth = np.random.default_rng(1).random((96, 96, 3)) + 0.5
+    a, b = noisy(truth, 0.3, 2)
+    mse = image_errors(truth + 0.1, a, b, 1.0)["mse"]
+    assert abs(mse.value - 0.01) < 4 * mse.error
+    assert mse.error < 0.002
+    # The plain error against the mean of the halves would be 0.01 + 0.3²/2.
+    assert np.mean((truth + 0.1 - (a + b) / 2) ** 2) > 0.05
+
+
 def test_noise_of_the_reference_hardly_biases_the_relative_error() -> None:
     """Only the denominator includes it; the square of one half's difference would be twice as large."""
     truth = np.ones((96, 96, 3))
