@@ -186,8 +186,8 @@ def test_exr_shards_too_large_for_memory_are_refused(tmp_path: Path) -> None:
 
 
 def test_memory_does_not_grow_with_the_data(tmp_path: Path, run_python: RunPython) -> None:
-    """30 MB more of shards take less than 10 MB more at the peak; in memory they would take 24."""
-    sizes = (1, 6)
+    """48 MB more of shards take less than 14 MB more at the peak; in memory they would take 38."""
+    sizes = (2, 10)
     for n in sizes:
         write_data(tmp_path / str(n), parallax, train=100_000 * n, test=10, shards=n)
     code = (
@@ -205,4 +205,4 @@ def test_memory_does_not_grow_with_the_data(tmp_path: Path, run_python: RunPytho
     done = run_python("-c", code)
     assert done.returncode == 0, done.stderr
     small, large = (int(line) / 1024 for line in done.stdout.split())
-    assert large - small < 10, (small, large)
+    assert large - small < 14, (small, large)
