@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from mbtf_gen.tile.fiber_tile import FiberTile
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
-from mbtf_gen.tile.heights import HeightGrid, tile_mesh
+from mbtf_gen.tile.heights import HeightGrid, grid_faces, grid_vertices
 from mbtf_gen.tile.protocol import Tile
 
 
@@ -29,6 +30,18 @@ def mitsuba_shapes(tile: Tile, unit: float, folder: Path, bsdf: Mapping[str, Any
         return _curves(tile, unit, folder)
     assert isinstance(tile, HeightFieldTile)
     return {"tile": height_field(tile.grid, unit, folder, bsdf)}
+
+
+def tile_mesh(grid: HeightGrid) -> Any:
+    """One period of the tile as a :class:`trimesh.Trimesh` with texture coordinates; lengths in tile
+    widths."""
+    vertices = grid_vertices(grid)
+    rows, columns = vertices.shape[:2]
+    flat = vertices.reshape(-1, 3)
+    uv = flat[:, :2] / (1.0, grid.aspect)
+    mesh = trimesh.Trimesh(flat, grid_faces(rows, columns), process=False)
+    mesh.visual = trimesh.visual.TextureVisuals(uv=uv)
+    return mesh
 
 
 def height_field(grid: HeightGrid, unit: float, folder: Path, bsdf: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.height_maps import fractal, normals_of, save_heights, save_normals
+from support.mitsuba_shapes import tile_mesh
 
 from mbtf_core.app.console import run
 from mbtf_core.config.yaml_file import read_yaml
@@ -23,8 +24,6 @@ from mbtf_gen.tile.loading import load_material
 @pytest.mark.parametrize("aspect", [1.0, 0.5])
 def test_slopes_are_those_of_the_mesh(aspect: float) -> None:
     """Against the triangles that are rendered."""
-    from mbtf_gen.tile.heights import tile_mesh
-
     grid = HeightGrid.from_map(fractal(int(12 * aspect), 12), 0.2, aspect)
     normals = tile_mesh(grid).face_normals
     expected = np.hypot(normals[:, 0], normals[:, 1]) / normals[:, 2]
