@@ -18,6 +18,8 @@ from mbtf_core.errors import MbtfError
 from mbtf_core.files.atomic import read_json, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
+# Scripts use the tests' tools, the package `support`: χ² tests, shapes of unmodified Mitsuba, killed runs.
+sys.path.insert(0, str(ROOT / "tests"))
 ASSETS = ROOT / "assets"
 # Texture sets are not part of the project; benchmarks skip those that are missing.
 TEXTURE_SETS = Path(os.environ.get("MBTF_TEXTURE_SETS", ROOT.parent / "shared" / "data" / "materials"))

@@ -31,9 +31,6 @@ from typing import Any
 
 import numpy as np
 from common import finish, parser_of, start
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-
 from support.file_operations import FileOperations, Operation
 from support.small_runs import command, contents, die, ending, generate, in_child, noisy_plane
 

@@ -29,7 +29,6 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -40,6 +39,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from common import alternate, finish, parser_of, start
 from numpy.typing import NDArray
+from support.mitsuba_shapes import mitsuba_shapes
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_gen.config.generator import Tracer
@@ -51,10 +51,6 @@ from mbtf_gen.tile.loading import load_material
 if TYPE_CHECKING:
     from mbtf_gen.render.path_tracer import Transport
     from mbtf_gen.render.scene import TileScene
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-
-from support.mitsuba_shapes import mitsuba_shapes
 
 MESH = 512
 DEPTH = 6

@@ -45,8 +45,6 @@ from common import (
     start,
 )
 from numpy.typing import NDArray
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from support.chi_square import Cap, chi_square_test
 
 from mbtf_core.directions import from_angles, from_projected_disk

@@ -280,7 +280,9 @@ def _indices(text: bytes, count: int | None) -> I64 | None:
             return out
     try:
         rows = [[int(number or 0) for number in word.split(b"/")] for word in text.split()]
-        return np.array([[*row, 0, 0][: max(3, len(row))] for row in rows], np.int64).reshape(-1, 3)
+        if any(len(row) > 3 for row in rows):
+            return None
+        return np.array([[*row, 0, 0][:3] for row in rows], np.int64).reshape(-1, 3)
     except (ValueError, OverflowError):
         return None
 

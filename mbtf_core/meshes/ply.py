@@ -31,6 +31,8 @@ _TYPES = {
 }
 _FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _MOST_HEADER = 1 << 20
+# Of a number of rows; Python refuses to read thousands of digits.
+_MOST_DIGITS = 18
 _SHORT = "ends before its last element: check that the file is complete"
 
 
@@ -91,7 +93,7 @@ def _header(text: str, path: Path) -> tuple[Literal["", "<", ">"], list[_Element
                 comments.append(line.strip().partition(" ")[2].strip())
             case ["format", name, *_] if name in _FORMATS:
                 order = _FORMATS[name]
-            case ["element", name, count] if count.isdecimal():
+            case ["element", name, count] if count.isdecimal() and len(count) <= _MOST_DIGITS:
                 elements.append(_Element(name, int(count)))
             case ["property", "list", length, kind, name] if (
                 elements and kind in _TYPES and _TYPES.get(length, "float")[0] != "f"
@@ -260,7 +262,7 @@ def read_ply(path: Path) -> MeshContent:
         raise InputError("its vertices have no x, y and z", where=path)
     positions = _stacked(vertex, _POSITION)
     stored, sizes = face.lists[corners]
-    if not ((stored >= 0) & (stored < len(positions))).all():
+    if not ((stored >= 0) & (stored < len(positions)) & (stored == np.floor(stored))).all():
         raise InputError(f"a face has a vertex that the file lacks; there are {len(positions):,}", where=path)
     number = stored.astype(np.int64)
     triangles, polygon, uncut = triangulate(positions[number], sizes)

@@ -93,7 +93,7 @@ class LearningCurve:
 
         self.last = float(t.max())
         b, level = (grid.ravel() for grid in np.meshgrid(_POWERS, _LEVELS, indexing="ij"))
-        fall = (t / self.last) ** -b[:, None]
+        fall = np.repeat((t / self.last) ** -_POWERS[:, None], len(_LEVELS), axis=0)
         shape = np.log(level[:, None] + (1.0 - level[:, None]) * fall)
         residual = np.log(e) - shape
         scale = (residual * w).sum(1) / w.sum()

@@ -64,8 +64,9 @@ class NeuralMaterial(nn.Module):
         moving = {r for o in operations if isinstance(o, ops.Offset) for r in _behind(operations, o.r)}
         for op in reversed(operations):
             self._create(op, sizes, moves=op.output in moving)
+        bounds = self.bounds
         for tensor in _scalars(operations):
-            self.register_buffer(tensor, torch.full((), UNBOUNDED if tensor in self.bounds else 1.0))
+            self.register_buffer(tensor, torch.full((), UNBOUNDED if tensor in bounds else 1.0))
         self.register_buffer(CALIBRATION, None)
 
     def _create(self, op: ops.Operation, sizes: Mapping[str, int], *, moves: bool) -> None:
@@ -119,8 +120,9 @@ class NeuralMaterial(nn.Module):
             *_, last_bias = network.parameters()
             for index, start in starts.get(name, {}).items():
                 last_bias.data[index] = start
+        bounds = self.bounds
         for tensor in _scalars(self._own):
-            self.number(tensor).fill_(most if tensor in self.bounds else unit)
+            self.number(tensor).fill_(most if tensor in bounds else unit)
 
     def run(
         self, wanted: Sequence[str], given: Mapping[str, Tensor], grid: tuple[int, int] | None = None

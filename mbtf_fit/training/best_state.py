@@ -87,20 +87,26 @@ def overfits(
     return excess.value > max(_SIGNIFICANT * excess.error, _LEAST * sum(errors))
 
 
-def lower_bound(trainer: Trainer, queries: ShardQueries) -> None:
+def lower_bound(trainer: Trainer, queries: ShardQueries, prediction: NDArray[np.float32]) -> None:
     """Divide the bound of learned values by the least power of 4 whose validation error is within a twentieth
     of the smallest. The bound stays at least :data:`~mbtf_fit.objective.noise.LEAST_BOUND`.
 
     There is no test of significance: a single glint makes a difference of one standard error, however bright
     it is, and bounds above the values of all validation queries make no difference.
+
+    Parameters
+    ----------
+    trainer : of the material
+    queries : for validation
+    prediction : their values (n, 3) at the present bound
     """
     bounds = [trainer.model.number(name) for name in trainer.model.bounds]
     first = float(bounds[0]) if bounds and len(queries) else 0.0
     tried = [most for k in range(_TRIED) if (most := first / 4.0**k) >= LEAST_BOUND]
     if len(tried) < 2:
         return
-    errors: list[float] = []
-    for most in tried:
+    errors = [noise_free_mse(prediction, *queries.halves).value]
+    for most in tried[1:]:
         for bound in bounds:
             bound.fill_(most)
         errors.append(noise_free_mse(trainer.predict(queries), *queries.halves).value)

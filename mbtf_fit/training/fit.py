@@ -337,9 +337,9 @@ def _train(
     if not all(reached(config, read_history(member.folder)) for member in members):
         _spend_budget(loop, report, checkpoint)
     trained = loop.progress
-    loop.keep_best(validation)
-    for trainer, queries in zip(trainers, validation, strict=True):
-        lower_bound(trainer, queries)
+    kept = loop.keep_best(validation)
+    for trainer, queries, prediction in zip(trainers, validation, kept, strict=True):
+        lower_bound(trainer, queries, prediction)
     export_fits(
         config,
         loop,

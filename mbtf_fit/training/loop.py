@@ -128,15 +128,18 @@ class TrainingLoop:
         if self.best is None or excess_error(predictions, self.best.predictions, subsets).value <= 0:
             self.best = BestState(weights_of(self), replace(self.progress), list(predictions))
 
-    def keep_best(self, subsets: Sequence[ShardQueries]) -> None:
-        """Return to the best state, if its errors are significantly smaller than the current ones."""
-        if self.best is None or self.best.progress.step == self.progress.step:
-            return
+    def keep_best(self, subsets: Sequence[ShardQueries]) -> Sequence[NDArray[np.float32]]:
+        """Return to the best state, if its errors are significantly smaller than the current ones; returns
+        the predictions of the state that is kept."""
         step, predictions = self.validated
         if step != self.progress.step:
             predictions = [t.predict(queries) for t, queries in zip(self.trainers, subsets, strict=True)]
-        if overfits(predictions, self.best.predictions, subsets):
-            load_weights(self, self.best.tensors, self.best.progress)
+        if self.best is None or self.best.progress.step == self.progress.step:
+            return predictions
+        if not overfits(predictions, self.best.predictions, subsets):
+            return predictions
+        load_weights(self, self.best.tensors, self.best.progress)
+        return self.best.predictions
 
     def _steps(self, workers: Workers) -> Iterator[Tensor]:
         """Endless steps from the current one on; each yields its mean loss."""

@@ -185,6 +185,7 @@ class Summary:
     shard_seconds : rendering time of all finished shards, over all runs
     relative_error : pooled relative standard error of the training values, √(mean variance) / mean value;
         None where their noise is unknown
+    relative_error_se : standard error of `relative_error`; None of fewer than four shards
     mean_value : mean training value per channel, 1/sr
     lost, capped, nonfinite : rays that slipped through the surface, rays cut at the cap on tile crossings,
         and non-finite samples that were sampled again, over all shards
@@ -205,6 +206,7 @@ class Summary:
     waiting_seconds: float
     shard_seconds: float
     relative_error: float | None
+    relative_error_se: float | None
     mean_value: list[float]
     lost: int
     capped: int
@@ -276,6 +278,7 @@ def finish(
         lost=totals.counts["lost_rays"],
         capped=totals.counts["capped_rays"],
         nonfinite=totals.counts["nonfinite_samples"],
+        relative_error_se=totals.relative_error_se(),
         effects=[EFFECTS[e.name].description for e in effects if e.on],
         measured=measured,
         **sums,

@@ -111,20 +111,6 @@ def grid_faces(rows: int, columns: int) -> NDArray[np.uint32]:
     return np.stack([first, second], axis=2).reshape(-1, 3)
 
 
-def tile_mesh(grid: HeightGrid) -> Any:
-    """One period of the tile as a :class:`trimesh.Trimesh` with texture coordinates; lengths in tile
-    widths."""
-    import trimesh
-
-    vertices = grid_vertices(grid)
-    rows, columns = vertices.shape[:2]
-    flat = vertices.reshape(-1, 3)
-    uv = flat[:, :2] / (1.0, grid.aspect)
-    mesh = trimesh.Trimesh(flat, grid_faces(rows, columns), process=False)
-    mesh.visual = trimesh.visual.TextureVisuals(uv=uv)
-    return mesh
-
-
 # Smallest z, a slope of 20, that 8-bit maps resolve.
 _SMALLEST_Z = 0.05
 

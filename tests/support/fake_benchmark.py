@@ -55,6 +55,6 @@ def fake_benchmark(monkeypatch: pytest.MonkeyPatch) -> GeneratorBenchmark:
     monkeypatch.setattr(f"{module}.build_estimator", lambda job, plan: FakeEstimator(job))
     monkeypatch.setattr(f"{module}.plan_effects", lambda job: plan.effects)
     monkeypatch.setattr(f"{module}.allocate", lambda job, effects: plan)
-    heights = np.random.default_rng(0).random((8, 8))
+    heights = np.random.default_rng(0).random((128, 128))
     material = HeightFieldTile(heights, height_scale=0.1, maps={"base_color": np.array([0.5, 0.5, 0.5])})
     return GeneratorBenchmark(GeneratorConfig(material="heights.npy"), material)

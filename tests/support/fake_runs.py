@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_pipeline.cost.measurement import Conditions, Configuration, Measurement
@@ -38,13 +37,9 @@ class FakeRuns:
         self.seeds, self.test = seeds, test
         self.shift = 1 + test * self.random.normal()
         self.measured: list[Run] = []
-        # Names of runs that fail.
-        self.failing: set[str] = set()
 
     def measure(self, run: Run, conditions: Conditions | None = None) -> Measurement:
         self.measured.append(run)
-        if run.name in self.failing:
-            raise InputError("training diverged at step 7")
         error = TRUE * self.shift * (1 + self.seeds * self.random.normal())
         seconds = run.planned_seconds(0.0)
         details = {"run_seconds": seconds + 1.0, "seed": float(run.seed), "queries": 1e6, "spp": 4.0}

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.data.schema import Queries
-from mbtf_gen.tile.heights import HeightGrid, tile_mesh
+from mbtf_gen.tile.heights import HeightGrid
+from support.mitsuba_shapes import height_field
 from support.scenes import mi, queries, rocks
 
 # After support.scenes, which loads Mitsuba.
@@ -21,34 +22,18 @@ SPP = 32
 def block(grid: HeightGrid, bsdf: dict[str, Any], folder: Path, tiles: int = 5) -> dict[str, Any]:
     """Scene entries of `tiles` × `tiles` instances of the tile, in the generator's scene units."""
     unit = LONG_SIDE / max(1.0, grid.aspect)
-    mesh = tile_mesh(grid)
-    mesh.apply_translation([-0.5, -0.5 * grid.aspect, 0.0])
-    mesh.apply_scale(unit)
-    path = folder / "tile.ply"
-    path.write_bytes(mesh.export(file_type="ply", vertex_normal=False))
-    entries: dict[str, Any] = {
-        "group": {
-            "type": "shapegroup",
-            "tile": {
-                "type": "ply",
-                "filename": str(path),
-                "face_normals": True,
-                "flip_tex_coords": True,
-                "bsdf": bsdf,
-            },
-        }
-    }
-    return entries | instances(unit, grid.aspect * unit, tiles // 2)
+    group = {"type": "shapegroup", "tile": height_field(grid, unit, folder, bsdf)}
+    return {"group": group, **instances(unit, grid.aspect * unit, tiles // 2, tiles // 2)}
 
 
-def instances(width: float, height: float, half: int = 2) -> dict[str, Any]:
-    """Entries of a block of instances of the scene's ``group``, `half` on each side of the central one."""
-    number, shift = range(-half, half + 1), mi.ScalarTransform4f().translate
+def instances(width: float, height: float, columns: int = 2, rows: int = 2) -> dict[str, Any]:
+    """Entries of a block of instances of the scene's ``group``, so many on each side of the central one."""
+    shift = mi.ScalarTransform4f().translate
     same = {"type": "instance", "group": {"type": "ref", "id": "group"}}
     return {
-        f"tile_{i + half}_{j + half}": {**same, "to_world": shift([i * width, j * height, 0.0])}
-        for i in number
-        for j in number
+        f"tile_{i + columns}_{j + rows}": {**same, "to_world": shift([i * width, j * height, 0.0])}
+        for i in range(-columns, columns + 1)
+        for j in range(-rows, rows + 1)
     }
 
 

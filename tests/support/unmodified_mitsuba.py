@@ -25,6 +25,7 @@ from mbtf_gen.config.generator import GeneratorConfig, LightSection
 from mbtf_gen.job import Job
 from mbtf_gen.tile.maps.material_file import ROLES
 from mbtf_gen.tile.protocol import Tile
+from support.mitsuba_blocks import instances
 from support.mitsuba_shapes import mitsuba_shapes
 
 F64 = NDArray[np.float64]
@@ -115,18 +116,8 @@ def _mitsuba_scene(job: Job, camera: Camera, omega_i: F64, folder: Path) -> dict
     slope = math.tan(math.radians(LOWEST_LIGHT))
     reach = 0.75 * camera.tiles_across + 2.0 * job.material.thickness / slope + 1.0
     columns, rows = (math.ceil(reach / side) for side in (1.0, aspect))
-    shift = mi.ScalarTransform4f().translate
     # The camera looks at the central tile.
     middle = np.array([camera.target[0] - 0.5, camera.target[1] - 0.5 * aspect])
-    instances = {
-        f"tile_{i + columns}_{j + rows}": {
-            "type": "instance",
-            "to_world": shift([float(i * unit), float(j * aspect * unit), 0.0]),
-            "group": {"type": "ref", "id": "group"},
-        }
-        for i in range(-columns, columns + 1)
-        for j in range(-rows, rows + 1)
-    }
     target = np.array([*middle, 0.0]) * unit
     forward, _, up = camera.frame()
     origin = target - forward * camera.distance * unit
@@ -159,7 +150,7 @@ def _mitsuba_scene(job: Job, camera: Camera, omega_i: F64, folder: Path) -> dict
             "irradiance": float(1.0 / omega_i[2]),
         },
         "group": {"type": "shapegroup", **tile},
-        **instances,
+        **instances(unit, aspect * unit, columns, rows),
     }
 
 

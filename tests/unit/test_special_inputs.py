@@ -15,6 +15,8 @@ from support.fit_data import constant, write_data
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("special")
     np.save(made / "heights.npy", np.random.default_rng(0).random((4, 8)))
+    (made / "good").mkdir()
+    np.save(made / "good/heights.npy", np.random.default_rng(0).random((4, 8)))
     for suffix in ("npy", "exr", "yaml", "pyp", "zip"):
         os.mkfifo(made / f"pipe.{suffix}")
     links = {"zero.png": "/dev/zero", "zero.yaml": "/dev/zero", "lost.npy": "nowhere/heights.npy"}
@@ -70,8 +72,14 @@ CASES = [
     (["mbtf-gen", "heights.npy", "--output="], "--output: is empty"),
     (["mbtf-gen", "verify", "caf\udce9"], "not UTF-8"),
     (["mbtf-fit", "shards", "-o", "caf\udce9"], "not UTF-8"),
-    (["mbtf-fit", "view", "nothing", "--port", "8.5"], "--port"),
-    (["mbtf-fit", "--many", "shards", "shards", "--processes", "1.5"], "--processes"),
+    # What no schema knows.
+    (["mbtf-gen", "good/heights.npy", "--queries", "1e12/texel"], "raise output.shard_queries"),
+    (["mbtf-gen", "good/heights.npy", "--slice", "4/3"], "4/3"),
+    (["mbtf-gen", "reference", "good/heights.npy", "--view", "5,0"], "elevation"),
+    (["mbtf-gen", "--queries", "5"], "no material"),
+    (["mbtf-gen", "good/heights.npy", "-o", "lost_map"], "holds no data set"),
+    (["mbtf-gen", "reference", "good/heights.npy", "-o", "lost_map"], "no pictures"),
+    (["mbtf-pipeline", "report", "lost_map"], "contains no run"),
 ]
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
+from support.mitsuba_shapes import tile_mesh
 from support.scenes import (
     Estimator,
     LightKernel,
@@ -28,7 +29,6 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import plan_effects, reference_plan
 from mbtf_gen.planning.simulation import build_estimator
-from mbtf_gen.tile.heights import tile_mesh
 from mbtf_gen.tile.loading import load_material
 from mbtf_gen.tile.mesh_tile import MeshPart, MeshTile
 

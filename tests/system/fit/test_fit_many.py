@@ -94,16 +94,6 @@ def test_a_fit_takes_model_and_network_from_the_folder(materials: Path, data: Pa
     assert all((own[name] == wanted[name]).all() for name in wanted)
 
 
-def test_the_same_command_keeps_a_finished_fit(data: Path, tmp_path: Path) -> None:
-    words = ["--many", str(data), "--shared-decoder", "-o", str(tmp_path / "m"), *QUICK]
-    first = call(["mbtf-fit", *words, "--json"])
-    assert first.code == 0, first.err
-    found = json.loads(first.out)
-    assert [fit["result"]["resumed"] for fit in found["fits"]] == [False] * 3
-    again = json.loads(call(["mbtf-fit", *words, "--json"]).out)
-    assert [fit["result"]["resumed"] for fit in again["fits"]] == [True] * 3
-
-
 def test_data_without_geometry_share_a_network_of_neumip(data: Path, tmp_path: Path) -> None:
     flat = write_data(tmp_path / "flat", constant(0.3), train=500, test=50)
     edit(flat / "manifest.json", lambda manifest: manifest.update(geometry=None))

@@ -12,8 +12,6 @@ from support.command_lines import call, fails
 from support.paths import ROOT
 from support.plugin_materials import write_material
 
-from mbtf_gen.engine.runtime import OLDEST_LLVM
-
 MOVE = "import os, sys; os.chdir(sys.argv[1])\n"
 
 CODE = """
@@ -71,31 +69,6 @@ def test_the_example_scene_in_xml_loads(tmp_path: Path, run_python: RunPython) -
     done = run_python("-c", MOVE + code, str(tmp_path), DRJIT_LIBLLVM_PATH=None)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["ConePath", "[8]", "9"]
-
-
-def test_a_late_import_is_refused(run_python: RunPython) -> None:
-    code = """
-import drjit.llvm, mitsuba as mi
-try:
-    mi.set_variant("llvm_ad_rgb")
-    import drjit as dr
-    dr.eval(mi.Float(1))
-except Exception:
-    print("no LLVM without ours")
-else:
-    try:
-        import mbtf_fit.backends.mitsuba
-        print("registered", drjit.detail.llvm_version()[0])
-    except Exception as error:
-        print(error)
-"""
-    done = run_python("-c", code, DRJIT_LIBLLVM_PATH=None)
-    assert done.returncode == 0, done.stderr
-    message = done.stdout.strip()
-    if message.startswith("registered"):
-        assert int(message.split()[1]) >= OLDEST_LLVM
-    else:
-        assert message == "no LLVM without ours" or message.startswith("Dr.Jit was imported first")
 
 
 BLOCKED = """

@@ -164,18 +164,6 @@ def test_the_report_can_be_written_again(
     assert list(again()) == ["report"]
 
 
-def test_a_run_of_another_schema_is_refused(
-    first: dict[str, Any], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    record = json.loads((folder / "run.json").read_text()) | {"schema": 1}
-    (tmp_path / "run.json").write_text(json.dumps(record))
-    for command in (["run", str(RECIPE), "-o", str(tmp_path)], ["report", str(tmp_path)]):
-        assert run(app, command) == 3
-        error, hint = capsys.readouterr().err.splitlines()
-        assert error.endswith("run.json: has schema version 1, this program reads version 2")
-        assert "another folder" in hint
-
-
 def test_a_cost_study_measures_reports_and_resumes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

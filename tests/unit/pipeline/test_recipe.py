@@ -5,23 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 import pytest
 from support.paths import ROOT
 
-from mbtf_core.app.console import Console, run
+from mbtf_core.app.console import Console
 from mbtf_core.app.options import Quality
 from mbtf_core.config.settings import resolve
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FITTER, FitConfig
 from mbtf_fit.sections import TimeBudget
 from mbtf_gen.config.generator import GENERATOR, GeneratorConfig, count_queries
-from mbtf_gen.generation import run as generation
-from mbtf_gen.job import Job
-from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.recipe import (
     COMPARE,
     load_recipe,
@@ -31,7 +27,7 @@ from mbtf_pipeline.recipe import (
     write_recipe,
 )
 from mbtf_pipeline.run import _material_inputs, _RecipeRun, survey
-from mbtf_pipeline.stages import NOT_RUN, Decision, run_stages
+from mbtf_pipeline.stages import run_stages
 
 HEAD = """\
 name: small
@@ -142,24 +138,6 @@ def test_every_path_is_relative_to_the_recipe(tmp_path: Path, monkeypatch: pytes
         assert fit["rainer2020"].training.materials == (f"{tmp_path}/c", f"{tmp_path}/d")
 
 
-def test_the_material_of_two_data_sets_is_announced_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its warnings, too."""
-    recipe = load_recipe(written(tmp_path, HEAD + "fit: {svbrdf: , hierarchical: }\n"))
-    announced, generated = list[Job](), list[Job]()
-
-    def generate(job: Job, *_: Any, **__: Any) -> Any:
-        generated.append(job)
-        return SimpleNamespace(shard_seconds=1.0)
-
-    monkeypatch.setattr(Job, "announce", lambda job: announced.append(job))
-    monkeypatch.setattr(generation, "generate", generate)
-    for stage in _RecipeRun(recipe, tmp_path / "run", Console(quiet=True)).stages({})[:2]:
-        stage.run(Decision(NOT_RUN))
-    assert (len(announced), len(generated)) == (1, 2)
-
-
 @pytest.mark.parametrize(
     ("text", "line", "what"),
     [
@@ -176,32 +154,6 @@ def test_errors_name_the_line(tmp_path: Path, text: str, line: int, what: str) -
         load_recipe(path)
     assert caught.value.where == f"{path}:{line}"
     assert what in caught.value.message
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "what"),
-    [
-        (["run", "recipe-under-tset.yaml"], 3, "did you mean 'recipe-under-test.yaml'?"),
-        (["run", "recipe-under-test.yaml", "--set", "generate.material=no.exr"], 3, "does not exist"),
-        (["run", "recipe-under-test.yaml", "--quality", "draft", "--set", "fit={}"], 2, "contains no fit"),
-        (["run", "recipe-under-test.yaml", "-o", "maps"], 3, "not empty"),
-        (["report", "maps"], 3, "contains no run"),
-    ],
-)
-def test_exit_codes(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    code: int,
-    what: str,
-) -> None:
-    written(tmp_path, SINGLE)
-    monkeypatch.chdir(tmp_path)
-    assert run(app, arguments) == code
-    err = capsys.readouterr().err
-    assert what in err
-    assert len(err.splitlines()) <= 2
 
 
 def test_the_resolved_recipe_can_be_run_again(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 from support.paths import ROOT
 
-from mbtf_core.app.console import run
+from mbtf_core.app.console import Console, run
 from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.errors import InputError
 from mbtf_core.files import folders
@@ -22,6 +23,7 @@ from mbtf_pipeline.cost import forecast
 from mbtf_pipeline.cost.forecast import forecast_errors
 from mbtf_pipeline.recipe import load_recipe, preset_recipe, with_training
 from mbtf_pipeline.run_time import RunForecaster, TimedRun, forecast_left
+from mbtf_pipeline.stages import run_stages, write_run_record
 
 FILE = ROOT / "pipelines" / "quickstart.yaml"
 # One fit, at the resolution of each preset.
@@ -181,6 +183,20 @@ def test_a_draft_is_suggested_where_its_steps_take_less_on_slow_machines(fake: M
     assert long is not None
     assert "faster" not in short
     assert long.endswith("; faster: --quality draft, or --time 2min")
+
+
+def test_a_draft_that_is_resumed_has_less_to_do(fake: Machine, one: Path) -> None:
+    """Its data are there; another draft is no faster than it."""
+    recipe, folder = preset_recipe(one, "draft", ["fit.training.time=5min"]), one.parent / "run"
+    folder.mkdir()
+    write_run_record(folder, recipe, "command")
+    first, *others = runs._RecipeRun(recipe, folder, Console(quiet=True)).stages(
+        runs._material_inputs(recipe)
+    )
+    run_stages(folder, [replace(first, outputs=(), run=lambda decision: None)])
+    left = RunForecaster(recipe).of(recipe, [stage.name for stage in others])
+    assert (left.start, left.generating) == (2.5, 0.0)
+    assert forecast_left(recipe, folder, lambda: recipe) == f"{left.describe()}; faster: --time 2min"
 
 
 def test_without_data_one_command_forecasts_the_errors_of_all_fits(

@@ -75,6 +75,7 @@ def test_all_forms_of_faces(tmp_path: Path, faces: str) -> None:
     [
         ("f 1 2 5", "lacks"),
         ("f 1 2 x", "numbers"),
+        ("f 1/1/1/1 2/2/1/1 3/3/1/1", "numbers"),
         ("f 1 2", "no triangles"),
         ("v 1 2\nf 1 2 3", "x, y, z"),
         ("v 1 2-3\nf 1 2 3", "numbers"),

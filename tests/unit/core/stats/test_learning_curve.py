@@ -23,7 +23,7 @@ def truth(power: float, level: float, time: float | NDArray[np.float64]) -> NDAr
 def test_intervals_contain_the_truth(power: float, level: float, deviation: float) -> None:
     """Of curves with noise: the error at twenty times the time, the time of an error, the limit."""
     random, inside = np.random.default_rng(1), np.zeros(3)
-    repeats = 80
+    repeats = 50
     for _ in range(repeats):
         curve = LearningCurve(TIMES, truth(power, level, TIMES) * np.exp(deviation * random.normal(size=6)))
         error, limit = curve.error_at(80.0), curve.limit

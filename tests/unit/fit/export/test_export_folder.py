@@ -13,7 +13,6 @@ from support.plugin_materials import write_material
 from mbtf_core.app.console import run
 from mbtf_fit.cli.app import app
 from mbtf_fit.export import targets
-from mbtf_fit.material.material import Material
 
 
 @pytest.fixture(scope="module")
@@ -38,18 +37,6 @@ def test_the_same_command_again_keeps_the_export(source: Path, tmp_path: Path) -
     assert {"material.json", "weights.safetensors"} < before.keys()
     assert export(source, out) == 0
     assert stamps(out) == before
-
-
-@pytest.mark.parametrize(
-    "lost", [("material.json",), ("material.json", "weights.safetensors"), ("weights.safetensors",)]
-)
-def test_an_unfinished_export_is_resumed(source: Path, tmp_path: Path, lost: tuple[str, ...]) -> None:
-    out = tmp_path / "out"
-    assert export(source, out) == 0
-    for name in lost:
-        (out / name).unlink()
-    assert export(source, out) == 0
-    assert Material.load(out).deviation() < 1e-4
 
 
 def test_a_file_beside_the_material_is_replaced_on_request_only(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,6 @@ from mbtf_fit.data.loader import load_split, load_training
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.evaluation import evaluate_splits, split_errors
 from mbtf_fit.formatting import report_errors
-from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.material import conformance_queries, export
 from mbtf_fit.models.registry import MODELS
 from mbtf_fit.sections import HeldOutSection
@@ -45,15 +43,6 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def fitted(data: Path, tmp_path_factory: pytest.TempPathFactory) -> FitResult:
     return fit(config(), data, tmp_path_factory.mktemp("fit") / "material")
-
-
-def test_a_folder_of_materials_names_them(fitted: FitResult, tmp_path: Path) -> None:
-    """As those of a run and of a library."""
-    inside = tmp_path / "library" / "rock" / "fits" / "relief"
-    shutil.copytree(fitted.folder, inside)
-    with pytest.raises(InputError) as caught:
-        Decoder.find(tmp_path / "library")
-    assert str(inside) in caught.value.hint
 
 
 def test_a_fit_states_the_lowest_direction_of_its_data(tmp_path: Path) -> None:
@@ -244,14 +233,6 @@ def test_a_changed_model_is_another_fit(data: Path, tmp_path: Path, monkeypatch:
     monkeypatch.setattr(MODELS["neumip"], "operations", lambda lattice, network: doubled)
     with pytest.raises(InputError, match="of another configuration: operations"):
         fit(config(3), data, out)
-
-
-def test_a_folder_of_other_files_is_never_touched(data: Path, tmp_path: Path) -> None:
-    (tmp_path / "precious").write_text("mine")
-    for overwrite in (False, True):
-        with pytest.raises(InputError, match="holds no fit"):
-            fit(config(3), data, tmp_path, overwrite=overwrite)
-    assert [p.name for p in tmp_path.iterdir()] == ["precious"]
 
 
 def test_evaluation_broadcasts_as_numpy_does(fitted: FitResult) -> None:

@@ -21,12 +21,14 @@ from mbtf_fit.backends.mitsuba.arcs import Arc, trace_arcs
 from mbtf_fit.backends.mitsuba.curvature import curvature, in_axes, with_normal_partials
 from mbtf_fit.backends.mitsuba.evaluator import Evaluator
 from mbtf_fit.backends.mitsuba.shade import DirectLight
-from mbtf_fit.backends.mitsuba.shell import tilted
+from mbtf_fit.backends.mitsuba.shell import Shell, ShellHit, tilted
 from mbtf_fit.backends.mitsuba.stored_material import read_material
 from mbtf_fit.material.transmittance import Transmittance
+from mbtf_fit.ops import Trace
 from mbtf_fit.surface.known import KnownSurface
 from mbtf_gen.pictures.shapes import Chart
 from mbtf_gen.tile.tracers.heightfield import HeightField
+from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
 F64 = NDArray[np.float64]
 DEPTH = 0.25
@@ -134,6 +136,42 @@ def test_rays_over_a_sphere_meet_what_small_steps_find(kappa: float, inside: boo
     lanes = np.arange(n)
     for found, exact in ((s, position), (height, r - radius)):
         assert np.quantile(np.abs(found - exact[first, lanes])[both], 0.95) < 3e-3
+
+
+def test_shadows_over_the_plane_are_those_that_small_steps_find() -> None:
+    """Of a surface that is curved, from points on the heights; lower light than that of the data is not
+    traced."""
+    n, least, random = 2000, 0.1, np.random.default_rng(6)
+    z = rough_heights(16, 16, DEPTH).astype(np.float64)
+    shell = Shell(
+        Trace("z", "hits", "u", "l", "omega_o", "heights"), HeightfieldGeometry.of(z, 1.0, 1.0, False), 1.0
+    )
+    z = z[::-1]
+    u, v = random.random((2, n))
+    up, azimuth = random.uniform(-0.2, 0.95, n), random.uniform(0, 2 * np.pi, n)
+    flat = np.sqrt(1 - up**2)
+    light = mi.Vector3f(np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), up]).astype(np.float32))
+    start = heights_at(z, u, v)
+    place, height = [mi.Float(x.astype(np.float32)) for x in (u, v)], mi.Float(start.astype(np.float32))
+    hit = ShellHit(
+        shell,
+        share=mi.Float(1.0),
+        u=mi.Point2f(*place),
+        heights=[height],
+        curvature=mi.Vector3f(1.0, 0.0, 1.0),
+        flat=mi.Bool(False),
+        tilt=mi.Vector2f(0.0),
+        leaves=mi.Bool(False),
+        omega_o=mi.Vector3f(0.0, 0.0, 1.0),
+        values={"z": [height], "hits": place},
+    )
+    ((_, found),) = hit.visibility(light, mi.Float(least))
+    rises = np.maximum(up, least)
+    t = np.linspace(0, 1, 4001)[1:, None] * (-start / rises)
+    ground = heights_at(z, u + t * flat * np.cos(azimuth), v + t * flat * np.sin(azimuth))
+    blocked = (start + t * rises < ground - 1e-4 * DEPTH).any(0) & (up > least)
+    assert 0.2 < blocked[up > least].mean() < 0.8
+    assert np.mean((np.array(found) == 0.0) == blocked) > 0.99
 
 
 TURN = np.array([[np.cos(0.6), -np.sin(0.6)], [np.sin(0.6), np.cos(0.6)]])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from support.pages import loads
-from support.plugin_materials import net, write_material
+from support.plugin_materials import write_material
 
 from mbtf_core.app.console import run
 from mbtf_core.errors import UsageError
@@ -88,23 +88,6 @@ def test_text_cannot_end_the_script() -> None:
     assert not set(text) & set("<>&\u2028é")
     assert json.loads(text) == {"name": "</script><!-- & \u2028 é"}
     assert "<b>" not in write_page({"materials": []}, "<b>bold</b>")
-
-
-def test_what_cannot_be_shown_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_material(tmp_path / "patches", model="hierarchical")
-    write_material(tmp_path / "good")
-    write_material(tmp_path / "mlp", model="hierarchical", **net(decoder="mlp"))
-    out = ["-o", str(tmp_path / "page")]
-    for words, code, what in (
-        (["export", str(tmp_path / "patches"), "--to", "web", *out], 3, "operation 'neighborhood'"),
-        (["export", str(tmp_path / "good"), "--shape", "x.obj", *out], 2, "--shape: is an option of web"),
-        (["view", str(tmp_path / "good"), "--port", "99999"], 2, "--port: cannot listen at port 99999"),
-    ):
-        assert run(app, words) == code, words
-        error = capsys.readouterr().err
-        assert what in error
-        assert "Traceback" not in error
-    assert run(app, ["export", str(tmp_path / "mlp"), "--to", "web", *out, "-q"]) == 0
 
 
 def test_only_this_machine_gets_the_page() -> None:

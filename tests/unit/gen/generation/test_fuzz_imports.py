@@ -65,7 +65,7 @@ def test_sound_files_are_imported(name: str, samples: dict[str, bytes], folder: 
 
 
 @given(data=st.data())
-@examples(250)
+@examples(120)
 def test_damaged_files(data: st.DataObject, samples: dict[str, bytes], folder: Path) -> None:
     _, content = data.draw(damaged(samples))
     found = loads_or_refuses(lambda: imported(content, folder))

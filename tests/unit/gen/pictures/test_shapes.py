@@ -115,8 +115,3 @@ def test_a_shape_is_seen_from_outside(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="inside the sphere") as caught:
         render_references(near, tmp_path / "near", Console(quiet=True))
     assert str(caught.value.hint).endswith("1.5")
-
-
-def test_a_shape_has_no_queries() -> None:
-    with pytest.raises(InputError, match="kind query"):
-        ReferenceConfig.model_validate({"material": "m", "reference": {"surface": "torus", "kind": "query"}})

@@ -79,6 +79,8 @@ def test_effects_can_be_forced_on_and_off() -> None:
     assert plan.on("bsdf_sampling")
     assert plan["interreflection"].reason == "forced"
     assert plan_effects(job_of(FLAT, "all,-shadowing")).on("shadowing") is False
+    with pytest.raises(UsageError, match=r"'\+gloss' is not an effect"):
+        plan_effects(job_of(LAMBERT, "+gloss"))
 
 
 def test_effects_that_need_the_displaced_tile_are_off_without_it() -> None:

@@ -26,20 +26,6 @@ def test_the_same_command_gives_the_same_bytes(form: str, shards: Path, tmp_path
     assert contents(first) == contents(second)
 
 
-def test_other_options_are_refused_and_replace(shards: Path, tmp_path: Path) -> None:
-    card = publish(shards, tmp_path / "card", form="parquet")
-    (card / "mine.txt").write_text("kept")
-    before = contents(card)
-    with pytest.raises(InputError, match=r"another configuration: license: CC0-1\.0 -> CC-BY-4\.0"):
-        publish(shards, card, form="parquet", license="CC-BY-4.0")
-    assert contents(card) == before
-    config = PublishConfig(license="CC-BY-4.0", form="npz")
-    Publication.prepare(shards, config).write(card, overwrite=True)
-    assert not list(card.rglob("*.parquet"))
-    assert (card / "mine.txt").read_text() == "kept"
-    assert "CC-BY-4.0" in (card / "README.md").read_text()
-
-
 def test_damage_is_found_before_anything_is_written(shards: Path, tmp_path: Path) -> None:
     path = shards / "train-00001.npz"
     content = bytearray(path.read_bytes())
@@ -77,3 +63,17 @@ def test_links_do_not_change_with_the_data_set(tmp_path: Path) -> None:
     (tmp_path / "data/train-00000.npz").unlink()
     (tmp_path / "data/train-00000.npz").write_bytes(b"other")
     assert contents(card) == before
+
+
+def test_other_options_are_refused_and_replace(shards: Path, tmp_path: Path) -> None:
+    card = publish(shards, tmp_path / "card", form="parquet")
+    (card / "mine.txt").write_text("kept")
+    before = contents(card)
+    with pytest.raises(InputError, match=r"another configuration: license: CC0-1\.0 -> CC-BY-4\.0"):
+        publish(shards, card, form="parquet", license="CC-BY-4.0")
+    assert contents(card) == before
+    config = PublishConfig(license="CC-BY-4.0", form="npz")
+    Publication.prepare(shards, config).write(card, overwrite=True)
+    assert not list(card.rglob("*.parquet"))
+    assert (card / "mine.txt").read_text() == "kept"
+    assert "CC-BY-4.0" in (card / "README.md").read_text()

@@ -13,14 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from support.paths import ASSETS
 
-# Material → does it state a constant beside its maps?
-MATERIALS = {
-    "twisted_wool": True,
-    "straight_wool": True,
-    "turtle_shell": False,
-    "cliff_rock": True,
-    "insulation_foam": False,
-}
+MATERIALS = ("twisted_wool", "straight_wool", "turtle_shell", "cliff_rock", "insulation_foam")
 # A height map below a BSDF or a coat, and a mesh.
 FURTHER = ("coated_copper", "brushed_aluminum", "fish_scales")
 

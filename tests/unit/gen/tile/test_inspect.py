@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.height_maps import fractal, normals_of, save_heights, save_normals
+from support.mitsuba_shapes import tile_mesh
 
 from mbtf_core.app.console import run
 from mbtf_core.config.yaml_file import read_yaml
@@ -23,8 +24,6 @@ from mbtf_gen.tile.loading import load_material
 @pytest.mark.parametrize("aspect", [1.0, 0.5])
 def test_slopes_are_those_of_the_mesh(aspect: float) -> None:
     """Against the triangles that are rendered."""
-    from mbtf_gen.tile.heights import tile_mesh
-
     grid = HeightGrid.from_map(fractal(int(12 * aspect), 12), 0.2, aspect)
     normals = tile_mesh(grid).face_normals
     expected = np.hypot(normals[:, 0], normals[:, 1]) / normals[:, 2]
@@ -44,13 +43,6 @@ def folder(tmp_path: Path) -> Path:
     for name, pixels in (("albedo", color), ("opacity", column >= 24), ("metallic", column >= 50)):
         np.save(out / f"{name}.npy", pixels.astype(np.float64))
     return out
-
-
-def test_commands_without_data_warn_about_the_scale(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    config = GeneratorConfig(material=str(folder), geometry=GeometrySection(height_scale=2.0))
-    Job.load(config).announce_briefly()
-    assert "times as steep as its slopes" in caplog.text
-    assert "warnings" not in caplog.text
 
 
 def test_the_warning_about_the_scale_states_the_slopes_that_it_leads_to(folder: Path) -> None:

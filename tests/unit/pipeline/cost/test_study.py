@@ -20,7 +20,7 @@ from mbtf_core.errors import InputError, PartialError
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result, packed, run_task
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.cost import measurement, plan, schedule
+from mbtf_pipeline.cost import plan, schedule
 from mbtf_pipeline.cost import study as module
 from mbtf_pipeline.cost.generator import GeneratorBenchmark, GeneratorConfiguration
 from mbtf_pipeline.cost.measurement import (
@@ -215,21 +215,6 @@ def test_a_plan_writes_nothing_and_has_fewer_runs_beside_other_work(
     assert none.startswith("complete runs to measure: none; with 25% of the processors free, no complete run")
     assert "expected" not in none
     assert not (tmp_path / "study").exists()
-
-
-def test_a_study_expects_slower_runs_where_other_work_left_less(
-    fake: FakeRuns, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As its dry run does, before a run is measured."""
-    recipe, said = load_recipe(RECIPE, []), list[str]()
-    for share in (1.0, 0.25):
-        monkeypatch.setattr(measurement, "processor_share", lambda share=share: share)
-        module.run_study(
-            recipe, tmp_path / f"{share}", seconds=190.0, progress=lambda spent, note: said.append(note)
-        )
-    first = [note for note in said if note.startswith("run, neumip, short, about")]
-    # 60 s, and 7 s or 28 s besides.
-    assert [note.rpartition(" ")[2] for note in first] == ["1:07", "1:28"]
 
 
 def test_other_seeds_and_materials_are_not_mixed(fake: FakeRuns, tmp_path: Path) -> None:

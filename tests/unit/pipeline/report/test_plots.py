@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 from matplotlib.figure import Figure
 
 from mbtf_pipeline.report.labels import place_labels
-from mbtf_pipeline.report.plots import Series, plot
 
 
 def test_labels_keep_away_from_marks_and_from_each_other() -> None:
@@ -28,13 +25,3 @@ def test_labels_keep_away_from_marks_and_from_each_other() -> None:
         for x, y in ((np.linspace(0, 10, 500), 5.3), (np.linspace(2.2, 7.8, 300), 4.6)):
             points = axes.transData.transform(np.stack([x, np.full_like(x, y)], -1))
             assert not any(box.contains(*point) for point in points)
-
-
-def test_the_axis_shows_a_band_and_the_legend_names_bars() -> None:
-    """The band ends at 0.004, below half of the smallest value."""
-    band = Series("forecast", [1.0, 2.0, 4.0], [0.04, 0.03, 0.02], [[0.01, 0.015, 0.016], [0.01] * 3])
-    bars = Series("runs", [1.0], [0.04], x_error=[0.5], style="points", x_error_name="other work")
-    svg = plot([band, bars], "x", "y", "label")
-    assert ">other work<" in svg
-    ticks = [float(text) for text in re.findall(r">([\d.]+)</text>", svg)]
-    assert min(ticks) <= 0.005
