@@ -22,7 +22,7 @@ from mbtf_fit.surface.known import KnownSurface
 # Standard deviation of the initial features; weight of the traced displacement before training.
 FEATURE_SCALE, FIRST_WEIGHT = 0.1, 0.9
 # Operations that read the surface.
-_SURFACE = (ops.Trace, ops.Shade)
+_SURFACE = (ops.Trace, ops.Shade, ops.SurfaceMaps)
 # Tensor of the calibration factors.
 CALIBRATION = "calibration"
 # Bound of learned values that have none, in units.

@@ -25,7 +25,7 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.material.material import export
 from mbtf_fit.ops import Lobe, Lookup, Operation, Transform
 from mbtf_fit.pytorch.material import NeuralMaterial
-from mbtf_fit.training.sampler import distill
+from mbtf_fit.training import sampler as training
 
 COUNT = 32
 
@@ -67,6 +67,24 @@ def test_samples_have_the_stated_density() -> None:
     assert np.median(p) > 0.1, p
 
 
+def test_distillation_has_the_density_of_the_plugin() -> None:
+    """Of random mixtures, and its own lights have the density that it states."""
+    random = np.random.default_rng(0)
+    outputs = torch.tensor(random.normal([-1, 0, -1, 0, 0, 0], 0.5, (8, 6)).astype(np.float32))
+    views = torch.tensor(random_directions(random, 8)).float()[:, None]
+    lobe, count = training.Lobe.of(outputs), 1 << 14
+    light, density = lobe.sample(views, count, torch.Generator().manual_seed(0))
+    above = density > 0
+    solid = torch.where(above, 1 / density, 0).double()
+    deviation = (solid.mean(1) - 2 * np.pi) / (solid.std(1) / count**0.5)
+    assert deviation.abs().max() < 4.5
+    light = torch.where(above[..., None], light, views)
+    x, wo = (np.repeat(a.numpy(), count, 0).T for a in (outputs, views[:, 0]))
+    mixture = Mixture.of([mi.Float(v) for v in x], mi.Vector3f(wo))
+    expected = np.array(mixture.density(mi.Vector3f(light.view(-1, 3).T.numpy())))
+    np.testing.assert_allclose(lobe.mixture(light, views).flatten(), expected, rtol=2e-3)
+
+
 # A tilted GGX surface: base color, F0, α², slopes.
 BASE, F0, ALPHA, TILT = 0.05, 0.5, 0.15, (0.2, -0.1)
 
@@ -76,7 +94,7 @@ def distilled(folder: Path, texel: tuple[float, ...], *value: Operation) -> Path
     lattice = Lattice(1)
     model = NeuralMaterial(lattice, [Lookup("texel", "u", "level", "map", len(texel)), *value])
     model.texture("map").texels.data[:] = torch.tensor(texel)
-    sampler = distill(model, 1 << 24, 0.1, 0)
+    sampler = training.distill(model, 1 << 24, 0.1, 0)
     stated = {"hash": "0" * 64, "min_cos": 0.1}
     export(model, FitConfig(), folder, data=stated, training=TRAINING, sampler=sampler)
     return folder
