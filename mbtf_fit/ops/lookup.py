@@ -123,8 +123,7 @@ class Trace(Operation):
 
 @dataclass(frozen=True)
 class SurfaceMaps(Operation):
-    """All numbers of the surface's filtered maps, which :class:`~mbtf_fit.ops.shade.Shade` lists, at the
-    level ``l + finer``.
+    """All numbers of the maps of :class:`~mbtf_fit.ops.shade.Shade`, at the level ``l + finer``.
 
     Attributes
     ----------
