@@ -43,7 +43,7 @@ F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
-class Lobe:
+class LightMixture:
     """(S2) The mixture for each query: lower triangle of L, s0 (queries, 1), and the reflection's weight."""
 
     l11: Tensor
@@ -54,7 +54,7 @@ class Lobe:
     weight: Tensor
 
     @classmethod
-    def of(cls, outputs: Tensor) -> Lobe:
+    def of(cls, outputs: Tensor) -> LightMixture:
         """Of outputs (queries, 6)."""
         a, shear, b, x, y, logit = outputs.split(1, 1)
         l11, l22 = (LEAST_ALPHA + v.clamp_max(LARGEST_LOG).exp() for v in (a, b))
@@ -64,7 +64,7 @@ class Lobe:
         tx = (x - self.x) / self.l11
         return tx.square() + ((y - self.y - self.l21 * tx) / self.l22).square()
 
-    def mixture(self, light: Tensor, view: Tensor) -> Tensor:
+    def density(self, light: Tensor, view: Tensor) -> Tensor:
         """(S1) Density (queries, lights) of lights (queries, lights, 3) for views (queries, 1, 3)."""
         half = light + view
         x, y, z = half.unbind(-1)
@@ -117,7 +117,7 @@ class Samples:
 
     def loss(self, network: Mlp, rows: Tensor, dark: Tensor) -> Tensor:
         """Mean over some queries."""
-        density = Lobe.of(network(self.inputs[rows])).mixture(self.light[rows], self.view[rows])
+        density = LightMixture.of(network(self.inputs[rows])).density(self.light[rows], self.view[rows])
         moment = (self.squares[rows] / density.clamp_min(1e-12)).mean(1)
         return (moment / (self.mean2[rows] + dark)).mean()
 
@@ -211,7 +211,7 @@ def _draw(
 ) -> Samples:
     view = torch.from_numpy(queries[2])[:, None]
     with torch.no_grad():
-        light, density = Lobe.of(network(inputs)).sample(view, LIGHTS, generator)
+        light, density = LightMixture.of(network(inputs)).sample(view, LIGHTS, generator)
     above = density > 0
     light = torch.where(above[..., None], light, torch.tensor([0.0, 0.0, 1.0]))
     each = [np.repeat(a, LIGHTS, 0) for a in queries]

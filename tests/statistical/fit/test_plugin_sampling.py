@@ -72,7 +72,7 @@ def test_distillation_has_the_density_of_the_plugin() -> None:
     random = np.random.default_rng(0)
     outputs = torch.tensor(random.normal([-1, 0, -1, 0, 0, 0], 0.5, (8, 6)).astype(np.float32))
     views = torch.tensor(random_directions(random, 8)).float()[:, None]
-    lobe, count = training.Lobe.of(outputs), 1 << 14
+    lobe, count = training.LightMixture.of(outputs), 1 << 14
     light, density = lobe.sample(views, count, torch.Generator().manual_seed(0))
     above = density > 0
     solid = torch.where(above, 1 / density, 0).double()
@@ -82,7 +82,7 @@ def test_distillation_has_the_density_of_the_plugin() -> None:
     x, wo = (np.repeat(a.numpy(), count, 0).T for a in (outputs, views[:, 0]))
     mixture = Mixture.of([mi.Float(v) for v in x], mi.Vector3f(wo))
     expected = np.array(mixture.density(mi.Vector3f(light.view(-1, 3).T.numpy())))
-    np.testing.assert_allclose(lobe.mixture(light, views).flatten(), expected, rtol=2e-3)
+    np.testing.assert_allclose(lobe.density(light, views).flatten(), expected, rtol=2e-3)
 
 
 # A tilted GGX surface: base color, F0, α², slopes.
