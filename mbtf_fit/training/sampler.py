@@ -33,7 +33,7 @@ from mbtf_fit.pytorch.networks import Mlp, initialize_layers
 QUERIES, LIGHTS = 1 << 13, 32
 # Evaluations, as a share of the training queries of a fit.
 SHARE = 1 / 8
-ROUNDS, STEPS, BATCH, LEARNING_RATE = 2, 400, 512, 1e-2
+ROUNDS, STEPS, BATCH, LEARNING_RATE = 2, 300, 512, 1e-2
 # The reflection at the start, which half of the directions are of.
 FIRST_ALPHA = 0.4
 # Where a query reflects little, its variance counts less: δ, as a share of the mean of I².
