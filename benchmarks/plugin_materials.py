@@ -10,7 +10,7 @@ material is then measured in a process of its own, with an empty kernel cache:
 - **conformance**: largest deviation from the material's conformance values, in single and half precision;
 - **χ²** of the plugin's samples at 32 random positions, footprints and views; the smallest p of all
   materials is corrected for their number (Šidák);
-- **variance** of the light reflected under a constant sky by cosine sampling, over that by the lobes; the
+- **variance** of the light reflected under a constant sky by cosine sampling, over that by the sampler; the
   threshold is for glossy materials, as their maps and the variance of cosine sampling show;
 - **energy**: reflectance of the tile by elevation of the light, beside the path-traced one of the same
   queries, with the error of the paired difference.

@@ -23,6 +23,7 @@ def write(export: Export, options: None) -> list[str]:
             training=description["training"],
             half=export.half,
             transmittance=material.transmittance,
+            sampler=material.sampler,
         )
         found = written.evaluate(*(material.conformance[name] for name in QUERY))
         check_values(found, material, export.folder / DESCRIPTION_NAME)

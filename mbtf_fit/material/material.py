@@ -36,6 +36,7 @@ from mbtf_fit.material.format import (
     write_tensors,
 )
 from mbtf_fit.material.inference import evaluate_in_chunks, predict
+from mbtf_fit.material.sampler import Sampler, is_of_sampler
 from mbtf_fit.material.transmittance import (
     TRANSMITTANCE_NAME,
     Transmittance,
@@ -43,6 +44,7 @@ from mbtf_fit.material.transmittance import (
     write_transmittance,
 )
 from mbtf_fit.ops import read_operations
+from mbtf_fit.ops.sampler import SAMPLER
 from mbtf_fit.pytorch.material import NeuralMaterial
 
 
@@ -129,6 +131,8 @@ class Material:
         expected values ``rgb`` (n, 3).
     transmittance : Transmittance or None
         Transparent fraction of footprints; None for an opaque material.
+    sampler : Sampler or None
+        Says where light matters, for importance sampling; None for the cosine.
     """
 
     model: NeuralMaterial
@@ -136,6 +140,7 @@ class Material:
     description: dict[str, Any]
     conformance: dict[str, NDArray[np.float32]]
     transmittance: Transmittance | None = None
+    sampler: Sampler | None = None
 
     @classmethod
     def load(cls, folder: str | Path, device: str = "cpu") -> Material:
@@ -175,9 +180,15 @@ class Material:
         model.to_empty(device="cpu")
         tensors = read_weights(weights)
         conformance = check_conformance(tensors, description, weights)
-        model.load_weights({n: t for n, t in tensors.items() if not n.startswith("conformance.")})
+        own = {n: t for n, t in tensors.items() if not n.startswith("conformance.") and not is_of_sampler(n)}
+        model.load_weights(own)
         model.to(device).requires_grad_(False)
-        return cls(model, config, description, conformance, read_transmittance(Path(folder), description))
+        try:
+            sampler = Sampler.read(description, tensors, model.operations)
+        except ValueError as error:
+            raise InputError(reason(error), where=weights.with_name(DESCRIPTION_NAME), hint=AGAIN) from None
+        transmittance = read_transmittance(Path(folder), description)
+        return cls(model, config, description, conformance, transmittance, sampler)
 
     def __repr__(self) -> str:
         return f"<Material: {self.model.name}, resolution {self.lattice.shape()[1]}>"
@@ -287,6 +298,7 @@ def export(
     training: dict[str, Any],
     half: bool = False,
     transmittance: Transmittance | None = None,
+    sampler: Sampler | None = None,
 ) -> Material:
     """Write a model as a material and return it as read back.
 
@@ -306,6 +318,9 @@ def export(
         extra["transmittance"] = {"file": TRANSMITTANCE_NAME, "sha256": written.sha256}
     queries = conformance_queries(model.lattice)
     weights = model.weights()
+    if sampler is not None:
+        extra[SAMPLER] = [op.as_json() for op in sampler.operations]
+        weights |= sampler.tensors
     if half:
         weights = {name: tensor.half() if tensor.ndim else tensor for name, tensor in weights.items()}
     queries["rgb"] = conformance_values(model, queries)

@@ -196,6 +196,9 @@ class NumpyMaterial:
     def displace(self, u, z, level, omega_o, weights):
         return u + np.interp(level, range(len(weights)), weights) * z * omega_o[:2] / omega_o[2] / self.scale
 
+    def surface_maps(self, u, level, maps, finer, **_):
+        return self.lookup(u, level + finer, maps)
+
     def shade(self, hits, level, omega_i, omega_o, maps, horizons, light_width, dielectric, finer, light_blur,
               least_view, least_variance, alpha2):  # fmt: skip
         hints = []

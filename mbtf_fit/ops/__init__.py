@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mbtf_fit.ops.lookup import Displace, Lookup, Neighborhood, Offset, Trace
+from mbtf_fit.ops.lookup import Displace, Lookup, Neighborhood, Offset, SurfaceMaps, Trace
 from mbtf_fit.ops.network import (
     Frequencies,
     HalfVector,
@@ -39,6 +39,7 @@ __all__ = [
     "Shade",
     "Standardize",
     "Stereographic",
+    "SurfaceMaps",
     "ToFrame",
     "Trace",
     "Transform",

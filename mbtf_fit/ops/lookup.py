@@ -122,6 +122,28 @@ class Trace(Operation):
 
 
 @dataclass(frozen=True)
+class SurfaceMaps(Operation):
+    """All numbers of the maps of :class:`~mbtf_fit.ops.shade.Shade`, at the level ``l + finer``.
+
+    Attributes
+    ----------
+    u, level : position (2), fractional level (1)
+    maps : textures by level
+    channels : numbers of the maps: 8, 10 of glossy surfaces, 12 of coated ones
+    finer : levels
+    """
+
+    u: Value
+    level: Value
+    maps: TextureName
+    channels: int
+    finer: float = 0.0
+
+    def size(self, sizes: Sequence[int]) -> int:
+        return self.channels
+
+
+@dataclass(frozen=True)
 class Displace(Operation):
     """Displacement of a position by a height: ``u' = u + w_l z / ω_o,z · ω_o,xy / (1, aspect)``.
 

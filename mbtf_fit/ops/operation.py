@@ -234,12 +234,19 @@ def _adapter(kind: str) -> TypeAdapter[Operation]:
 
 
 def read_operations(data: Any) -> list[Operation]:
-    """Operations from plain data of :meth:`Operation.as_json`.
+    """Operations of a value from plain data of :meth:`Operation.as_json`.
 
     Raises
     ------
     ValueError : an operation is unknown, or a key is missing, unknown or of a wrong type
     """
+    out = parse_operations(data)
+    sizes_of(out)
+    return out
+
+
+def parse_operations(data: Any) -> list[Operation]:
+    """The same without the check that they compute a value."""
     if not isinstance(data, list):
         raise ValueError("operations are no list")
     if len(data) > _MOST_OPERATIONS:
@@ -256,7 +263,6 @@ def read_operations(data: Any) -> list[Operation]:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"]))
             raise ValueError(f"operation {k} ({kind}): {where}: {first['msg']}") from None
-    sizes_of(out)
     return out
 
 

@@ -22,7 +22,7 @@ from mbtf_fit.surface.known import KnownSurface
 # Standard deviation of the initial features; weight of the traced displacement before training.
 FEATURE_SCALE, FIRST_WEIGHT = 0.1, 0.9
 # Operations that read the surface.
-_SURFACE = (ops.Trace, ops.Shade)
+_SURFACE = (ops.Trace, ops.Shade, ops.SurfaceMaps)
 # Tensor of the calibration factors.
 CALIBRATION = "calibration"
 # Bound of learned values that have none, in units.
@@ -136,8 +136,18 @@ class NeuralMaterial(nn.Module):
         key = tuple(wanted), frozenset(given)
         if key not in self._plans:
             self._plans[key] = needed_for(self.operations, wanted, [*given])
+        values = self.execute(self._plans[key], given, grid)
+        return [values[name] for name in wanted]
+
+    def execute(
+        self,
+        operations: Sequence[ops.Operation],
+        given: Mapping[str, Tensor],
+        grid: tuple[int, int] | None = None,
+    ) -> dict[str, Tensor]:
+        """The given values, and those of some operations."""
         run, values = Execution(self, grid), dict(given)
-        for op in self._plans[key]:
+        for op in operations:
             read = op.arguments(lambda name, part: _read(values, name, part))
             arguments: list[object] = [*map(_shaped, op.value_fields(), read)]
             if not isinstance(op, ops.Inception):
@@ -145,7 +155,7 @@ class NeuralMaterial(nn.Module):
             found = PYTORCH[op](op, run, *arguments)
             found = (found,) if isinstance(found, Tensor) else found
             values.update(zip(output_names(op), found, strict=True))
-        return [values[name] for name in wanted]
+        return values
 
     def forward(
         self, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor, hints: Tensor | None = None
@@ -421,6 +431,12 @@ def _first_outputs(operations: Sequence[ops.Operation]) -> dict[str, dict[int, f
 def _read(values: Mapping[str, Tensor], name: str, part: slice) -> Tensor:
     """Some numbers of a value; all of them as they are."""
     return values[name] if part == slice(None) or values[name].ndim == 1 else values[name][:, part]
+
+
+def read_values(values: Mapping[str, Tensor], references: Sequence[str]) -> Tensor:
+    """Values (n, numbers), concatenated."""
+    found = (_shaped("x", _read(values, *parse(reference))) for reference in references)
+    return torch.cat([x for x in found if isinstance(x, Tensor)], 1)
 
 
 def _shaped(field: str, argument: Tensor | list[Tensor] | None) -> object:

@@ -113,6 +113,11 @@ def _trace(op: ops.Trace, run: Execution, u: Tensor, level: Tensor, omega_o: Ten
     return run.material.known.intersections(op, u, level, omega_o)
 
 
+@PYTORCH.implements(ops.SurfaceMaps)
+def _surface_maps(op: ops.SurfaceMaps, run: Execution, u: Tensor, level: Tensor) -> Tensor:
+    return run.material.known.read_maps(u, level + op.finer)
+
+
 @PYTORCH.implements(ops.Displace)
 def _displace(
     op: ops.Displace, run: Execution, u: Tensor, z: Tensor, level: Tensor, omega_o: Tensor

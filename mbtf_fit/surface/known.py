@@ -204,6 +204,10 @@ class KnownSurface:
             total = total + z
         return total / len(trace.places), torch.cat(hits, 1)
 
+    def read_maps(self, hit: Tensor, level: Tensor) -> Tensor:
+        """All numbers of the maps (n, channels) at surface points (n, 2); levels (n,)."""
+        return lookup(self._map_copies.on(hit.device), self.map_table[1], hit, level)
+
     def shading(self, shade: Shade, hits: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """Irradiance, normal (x, y) and core (RGB) (n, 6): means over the intersections (n, 2·places)."""
         finer = level + shade.finer
@@ -212,7 +216,7 @@ class KnownSurface:
 
     def _shade(self, op: Shade, hit: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """Irradiance, normal and core (n, 6) at surface points."""
-        maps = lookup(self._map_copies.on(hit.device), self.map_table[1], hit, level)
+        maps = self.read_maps(hit, level)
         center, base = maps[:, :2], maps[:, 5:8]
         spread = doubled_scatter(center, maps[:, 2:5])
         normal = torch.nn.functional.normalize(torch.cat([-center, torch.ones_like(center[:, :1])], 1), dim=1)

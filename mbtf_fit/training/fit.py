@@ -159,7 +159,7 @@ def fit(
         Replace a fit of another configuration.
     progress : callable, optional
         Called with the phase (``reading``, ``preparing``, ``training``, ``calibrating``, ``predicting``,
-        ``writing``), the fraction of it that is done, in [0, 1], and one line of text.
+        ``distilling``, ``writing``), the fraction of it that is done, in [0, 1], and one line of text.
     observe : callable, optional
         Called after each validation with its record, the trainer, and the queries of the validation.
 

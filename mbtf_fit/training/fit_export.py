@@ -16,10 +16,12 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import Partition
 from mbtf_fit.evaluation import evaluate_splits
 from mbtf_fit.material.decoder import Decoder
+from mbtf_fit.material.format import DEFAULT_MIN_COS
 from mbtf_fit.material.material import export
 from mbtf_fit.material.transmittance import evaluate_transmittance, fit_transmittance
 from mbtf_fit.training.fit_folder import configuration_digest, training_digest
 from mbtf_fit.training.loop import TrainingLoop
+from mbtf_fit.training.sampler import distill
 from mbtf_fit.training.trainer import Trainer, TrainingProgress
 
 
@@ -108,6 +110,9 @@ def export_fit(
     if transmittance is not None:
         training["transmittance"] = evaluate_transmittance(transmittance, data, partition.selection)
     described = member.identity["data"]
+    least = described.get("min_cos", DEFAULT_MIN_COS)
+    announce("distilling", 0.0, name)
+    sampler = distill(trainer.model, share["steps"] * trainer.batch, least, config.seed)
     announce("writing", 0.0, name)
     export(
         trainer.model,
@@ -116,5 +121,6 @@ def export_fit(
         data=described,
         training=training | share,
         transmittance=transmittance,
+        sampler=sampler,
     )
     announce("writing", 1.0, name)

@@ -30,7 +30,7 @@ _PILOT_SECONDS, _PIECE_SECONDS = 5.0, 1.0
 _ENDLESS = 1e9
 # Seconds of a fit before its training and after it, and those of each query of its data: of the default model
 # at 64 and 128 texels, on two cores.
-_BEFORE, _AFTER = (3.0, 0.6e-6), (2.0, 0.1e-6)
+_BEFORE, _AFTER = (3.0, 0.6e-6), (5.0, 0.1e-6)
 
 
 def preparing_seconds(queries: float) -> float:
@@ -39,7 +39,7 @@ def preparing_seconds(queries: float) -> float:
 
 
 def closing_seconds(queries: float) -> float:
-    """Expected seconds of a fit after training: energy calibration, errors, writing."""
+    """Expected seconds of a fit after training: energy calibration, errors, distillation, writing."""
     return _AFTER[0] + _AFTER[1] * queries
 
 

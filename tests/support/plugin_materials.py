@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,12 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.files.atomic import file_sha256
 from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.material.material import Material, export
+from mbtf_fit.material.sampler import Sampler
 from mbtf_fit.material.transmittance import Transmittance
+from mbtf_fit.ops import Network
+from mbtf_fit.ops.operation import input_sizes
+from mbtf_fit.ops.sampler import sampler_of, sampler_sizes
+from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.surface.known import KnownSurface
 
 from .known_surfaces import geometry, rough_surface
@@ -39,6 +45,7 @@ def write_material(
     glossy: bool = True,
     coated: bool = False,
     known: KnownSurface | None = None,
+    sampled: bool = False,
     **data: Any,
 ) -> Material:
     """Write a material of random weights that all matter, and return it as read back.
@@ -53,6 +60,7 @@ def write_material(
     transmittance : None for an opaque material
     glossy, coated : whether the known surface of `relief` has a glossy lobe, and a clear coat
     known : another known surface
+    sampled : whether it has a sampler, of random weights
     data : what material.json states of the data set
     """
     config = FitConfig.model_validate({"model": model, "network": network or {}})
@@ -88,7 +96,33 @@ def write_material(
     built.load_weights(tensors)
     folder.mkdir(parents=True, exist_ok=True)
     stated = {"hash": "0" * 64, **data}
-    return export(built, config, folder, data=stated, training=TRAINING, transmittance=transmittance)
+    sampler = random_sampler(built, seed) if sampled else None
+    return export(
+        built,
+        config,
+        folder,
+        data=stated,
+        training=TRAINING,
+        transmittance=transmittance,
+        sampler=sampler,
+    )
+
+
+def random_sampler(model: NeuralMaterial, seed: int) -> Sampler:
+    """A sampler whose mixtures vary much with all inputs."""
+    generator = torch.Generator().manual_seed(seed)
+    channels = 0 if model.surface is None else model.surface.maps[0].shape[-1]
+    operations = sampler_of(model.stored_operations(), channels)
+    network = operations[-1]
+    assert isinstance(network, Network)
+    sizes = sampler_sizes(model.stored_operations(), operations)
+    tensors = {}
+    for k, (inputs, outputs) in enumerate(pairwise(network.widths(sum(input_sizes(network, sizes))))):
+        weight = torch.randn((outputs, inputs), generator=generator) / inputs**0.5
+        tensors |= {f"sampler.{k}.weight": weight, f"sampler.{k}.bias": torch.zeros(outputs)}
+    tensors["sampler.2.weight"] *= 0.5
+    tensors["sampler.2.bias"] = torch.tensor([-1.0, 0.3, -1.5, 0.1, -0.1, 0.5])
+    return Sampler(operations, tensors)
 
 
 def flat(lattice: Lattice, value: tuple[float, float, float]) -> KnownSurface:

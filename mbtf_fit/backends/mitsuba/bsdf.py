@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args
 
@@ -19,8 +20,8 @@ from mbtf_core.errors import InputError, UsageError
 from mbtf_core.pictures import pixel_sigma
 from mbtf_fit.backends.mitsuba.backend import Arithmetic
 from mbtf_fit.backends.mitsuba.curvature import curvature, in_axes, with_normal_partials
-from mbtf_fit.backends.mitsuba.evaluator import Evaluator
-from mbtf_fit.backends.mitsuba.lobes import LobeTextures, Mixture, fit_lobes
+from mbtf_fit.backends.mitsuba.evaluator import Evaluator, Values
+from mbtf_fit.backends.mitsuba.mixture import Mixture
 from mbtf_fit.backends.mitsuba.names import BSDF_NAME, footprints_provided, refuse_unknown
 from mbtf_fit.backends.mitsuba.partials import FootprintRequest, uv_partials
 from mbtf_fit.backends.mitsuba.shade import DirectLight
@@ -124,7 +125,7 @@ class MbtfBSDF(mi.BSDF):
         text, such as ``8,4``
     sigma : footprint in tile widths where the integrator provides none; default: that of the finest level
     networks : ``unrolled``, ``cooperative`` or ``half``; the default depends on variant and size
-    sampling : ``lobes`` (default) or ``cosine``
+    sampling : ``network`` (default), the material's sampler, or ``cosine``
     silhouettes : whether heights are traced over the curved surface, which is their top, and rays that miss
         them pass through the shape (default false)
     two_sided : whether the back looks as the front, mirrored at the surface (default false)
@@ -148,10 +149,7 @@ class MbtfBSDF(mi.BSDF):
         networks = self._choice(props, "networks", get_args(Arithmetic))
         self.evaluator = Evaluator(stored, networks)
         _check_conformance(self.evaluator, stored)
-        self.lobes = None
-        if self._choice(props, "sampling", ("lobes", "cosine")) != "cosine":
-            # Cooperative kernels do not depend on the material: they are compiled once.
-            self.lobes = LobeTextures(fit_lobes(Evaluator(stored, "cooperative")))
+        self.by_network = self._choice(props, "sampling", ("network", "cosine")) != "cosine"
         silhouettes, self.two_sided = self._switch(props, "silhouettes"), self._switch(props, "two_sided")
         if silhouettes and self.two_sided:
             hint = "silhouettes trace the front alone: leave one of them out"
@@ -361,10 +359,16 @@ class View:
             return mi.Float(0.0)
         return self.transmittance()
 
+    @cached_property
+    def values(self) -> Values:
+        """Values of stage 1 for the viewer at wi."""
+        viewer, hit = clamped(self.wi, self.bsdf.min_cos), self.hit
+        return self.bsdf.evaluator.stage1(self.u, self.level, viewer, None if hit is None else hit.values)
+
     def mixture(self) -> Mixture:
         """Density of the sampled directions."""
-        lobes = self.bsdf.lobes
-        return Mixture.cosine(self.wi) if lobes is None else lobes.at(self.u, self.level, self.wi)
+        bsdf = self.bsdf
+        return bsdf.evaluator.mixture(self.values, self.wi) if bsdf.by_network else Mixture.cosine(self.wi)
 
     def density(self, mixture: Mixture, wo: Vector3f) -> Float:
         """Density of a direction per solid angle on the surface."""
@@ -376,20 +380,19 @@ class View:
         viewer, light = (clamped(w, self.bsdf.min_cos) for w in (self.wi, wo))
         # Of the surface over that in the tile's frame.
         cosine = dr.rcp(self.frame.length(wo))
-        if ctx.mode == mi.TransportMode.Importance:
-            viewer, light = light, viewer
         evaluator, hit = self.bsdf.evaluator, self.hit
         if hit is None or ctx.mode == mi.TransportMode.Importance:
-            values = evaluator.stage1(self.u, self.level, viewer)
+            values = self.values
+            if ctx.mode == mi.TransportMode.Importance:
+                values, light = evaluator.stage1(self.u, self.level, light), viewer
             value = evaluator.value(values, light) * cosine * dr.maximum(wo.z, 0.0)
             return value if hit is None else value * hit.share
-        values = evaluator.stage1(self.u, self.level, viewer, hit.values)
         least = self.bsdf.min_cos
         visible = hit.visibility(wo, least)
         lit = DirectLight(visible, wo, dr.maximum(wo.z, least), least, hit.flat)
         curved = hit.light_cosine(wo, least, visible)
         cosine *= dr.select(hit.flat, dr.maximum(wo.z, 0.0), curved)
-        return evaluator.value(values, light, lit) * cosine * hit.share
+        return evaluator.value(self.values, light, lit) * cosine * hit.share
 
 
 def _check_conformance(evaluator: Evaluator, stored: StoredMaterial) -> None:

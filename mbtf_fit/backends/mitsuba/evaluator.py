@@ -12,11 +12,13 @@ from numpy.typing import ArrayLike
 from mbtf_core.errors import InputError
 from mbtf_fit.backends.mitsuba import lookup, network, shade
 from mbtf_fit.backends.mitsuba.backend import MITSUBA, Arithmetic, Loader, Numbers, Step
+from mbtf_fit.backends.mitsuba.mixture import Mixture
 from mbtf_fit.backends.mitsuba.stored_material import F32, StoredMaterial
 from mbtf_fit.backends.mitsuba.textures import Textures
 from mbtf_fit.material.format import DESCRIPTION_NAME
-from mbtf_fit.ops import Gate, Operation, Shade, Trace, sizes_of, stages
+from mbtf_fit.ops import Gate, Operation, Shade, Trace, stages
 from mbtf_fit.ops.operation import output_names, parse
+from mbtf_fit.ops.sampler import SAMPLER, sampler_sizes
 from mbtf_gen.engine.types import Color3f, Float, Point2f, Vector3f
 
 # Values by name.
@@ -52,12 +54,13 @@ class Evaluator:
                 hint="PyTorch evaluates this material: mbtf-fit evaluate, or mbtf_fit.Material.load",
             ) from None
         self.arithmetic = network.default_arithmetic(stored) if arithmetic is None else arithmetic
-        loader = Loader(stored, self.arithmetic, sizes_of(stored.operations))
+        loader = Loader(stored, self.arithmetic, sampler_sizes(stored.operations, stored.sampler))
         self.textures = loader.textures
         trace = next((op for op in stored.operations if isinstance(op, Trace)), None)
         self.shell = None if trace is None else lookup.shell_of(trace, loader)
         first, second = ([(op, MITSUBA[op](op, loader)) for op in part] for part in stages(stored.operations))
         self._first, self._second, self._last = first, second, stored.operations[-1].output
+        self._sampler = [(op, MITSUBA[op](op, loader)) for op in stored.sampler]
         self._core = _core(stored.operations)
         self._coefficients = None if stored.transmittance is None else Textures(stored.transmittance)
 
@@ -84,6 +87,13 @@ class Evaluator:
             name, part = self._core
             value = dr.lerp(mi.Color3f(*found[name][part]), value, lit.known)
         return dr.maximum(value, 0.0)
+
+    def mixture(self, values: Values, viewer: Vector3f) -> Mixture:
+        """Density of lights for a view vector, from values of stage 1; the cosine where the material has no
+        sampler."""
+        if not self._sampler:
+            return Mixture.cosine(viewer)
+        return Mixture.of(_run(self._sampler, values)[SAMPLER], viewer)
 
     def transmittance(self, u: Point2f, level: Float, omega_o: Vector3f) -> Float:
         """Transparent fraction of the footprint for unit vectors on either side of the plane, equal for

@@ -29,6 +29,13 @@ def _lookup(op: ops.Lookup, loader: Loader) -> Step:
     return lambda u, level: read(mi.Point2f(*u), *level)
 
 
+@MITSUBA.implements(ops.SurfaceMaps)
+def _surface_maps(op: ops.SurfaceMaps, loader: Loader) -> Step:
+    finer = Lattice(loader.lattice.finest + 1, loader.lattice.aspect)
+    maps = loader.texture(op.maps, [finer.shape(s) for s in range(finer.finest + 1)], op.channels)
+    return lambda u, level: maps.blended(mi.Point2f(*u), level[0] + op.finer)
+
+
 @MITSUBA.implements(ops.Calibrate)
 def _calibrate(op: ops.Calibrate, loader: Loader) -> Step:
     table = loader.stored.take(op.factors, (2, loader.lattice.finest + 1, None, 3))[op.table]

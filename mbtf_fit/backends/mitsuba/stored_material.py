@@ -24,6 +24,7 @@ from mbtf_fit.material.format import (
 )
 from mbtf_fit.material.transmittance import read_transmittance
 from mbtf_fit.ops import Operation, read_operations
+from mbtf_fit.ops.sampler import read_sampler
 
 F32 = NDArray[np.float32]
 
@@ -38,6 +39,7 @@ class StoredMaterial:
     lattice : texel grids of the tile
     min_cos : smallest cosine of the directions in the data
     operations : the list that computes the value in 1/sr
+    sampler : the list for importance sampling, empty without
     tensors : what the operations read, by name
     transmittance : coefficients (rows, columns, 6) by level; None for an opaque material
     conformance : queries ``u``, ``sigma``, ``omega_i``, ``omega_o`` and their values ``rgb`` (n, 3)
@@ -47,6 +49,7 @@ class StoredMaterial:
     lattice: Lattice
     min_cos: float
     operations: Sequence[Operation]
+    sampler: Sequence[Operation]
     tensors: Mapping[str, NDArray[Any]]
     transmittance: list[F32] | None
     conformance: dict[str, F32]
@@ -92,6 +95,7 @@ def read_material(folder: str | Path) -> StoredMaterial:
     description, weights = read_description(folder)
     try:
         operations = read_operations(description["operations"])
+        sampler = read_sampler(description["sampler"], operations) if "sampler" in description else []
     except ValueError as error:
         raise InputError(str(error), where=folder / DESCRIPTION_NAME, hint=AGAIN) from None
     tensors = read_weights(weights, "np")
@@ -101,6 +105,7 @@ def read_material(folder: str | Path) -> StoredMaterial:
         lattice_of(description),
         description["data"].get("min_cos", DEFAULT_MIN_COS),
         operations,
+        sampler,
         tensors,
         None if transmittance is None else transmittance.levels,
         check_conformance(tensors, description, weights),

@@ -106,7 +106,6 @@ class Code:
     lit : whether the current operation depends on the light, so that its code is part of stage 2
     images : by the names of their tensors
     weights : vectors (n, 4) of the networks' layers
-    lobe : of a surface that lights are sampled by, known in stage 1: normal (3) and α² (1); None for none
     """
 
     def __init__(
@@ -119,7 +118,6 @@ class Code:
         self.lit = False
         self.images: dict[str, TexelImage] = {}
         self.weights: list[F32] = []
-        self.lobe: str | None = None
         self.precise, self._kept = precise, kept
         self._included: set[str] = set()
         self._names = 0

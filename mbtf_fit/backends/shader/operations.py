@@ -53,6 +53,14 @@ def _lookup(op: ops.Lookup, code: Code, u: Value, level: Value | None) -> str | 
     return both[: op.channels] + both[4 * layers :]
 
 
+@SHADER.implements(ops.SurfaceMaps)
+def _surface_maps(op: ops.SurfaceMaps, code: Code, u: Value, level: Value) -> Value:
+    maps, out = code.image(op.maps, "maps"), code.variable("float4", op.output, -(-op.channels // 4))
+    pair = code.let("Pair", code.pair(maps, f"{level} + {number(op.finer)}", str(u)), "pair")
+    code.write(f"for (int k = 0; k < {maps.layers}; k++) {out}[k] = blended({maps}, {pair}, k);")
+    return Value.of_array(out, op.channels, code.lit)
+
+
 @SHADER.implements(ops.Offset)
 def _offset(op: ops.Offset, code: Code, u: Value, r: Value, omega_o: Value) -> str:
     moved = f"{number(op.scale)} * {r}"
@@ -117,9 +125,6 @@ def _shade(op: ops.Shade, code: Code, hits: Value, level: Value, omega_i: Value,
             *([f"  {coats}[k] = coat_at({maps}, p, {places}[k], {given});"] if coated else []),
             "}",
         )
-        if glossy and not code.lit:
-            facets = f"{places}[0].facets.matrix"
-            code.lobe = f"float4(normal_of({places}[0]), min(0.5 * ({facets}.x + {facets}.z), 1.0))"
     core = "irradiance * at.base / PI"
     if glossy:
         f0 = code.scalar(op.dielectric)
@@ -166,8 +171,6 @@ def _lobe(
             f"{normal} = normalize(float3(-{slopes}, 1.0));",
             f"{roughness} = max({alpha2}, {number(op.least_alpha2)});",
         )
-        if not code.lit:
-            code.lobe = f"float4({normal}, {roughness})"
     f0 = str(specular) if len(specular) == 3 else f"float3({specular}, {specular}, {specular})"
     least = vector((op.least_light, op.least_view))
     irradiance = f"max(dot({normal}, {omega_i}), 0.0) / {omega_i[2:]}"

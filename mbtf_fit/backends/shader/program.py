@@ -12,7 +12,8 @@ from mbtf_fit.backends.shader.backend import SHADER, Code, Value
 from mbtf_fit.backends.shader.images import F32, TexelImage
 from mbtf_fit.backends.shader.syntax import Syntax, number
 from mbtf_fit.material.material import Material
-from mbtf_fit.ops.operation import INPUTS, output_names, parse, reached_from, sizes_of
+from mbtf_fit.ops.operation import INPUTS, output_names, parse, reached_from
+from mbtf_fit.ops.sampler import BOUNDS, SAMPLER, sampler_sizes
 
 # Image of its coefficients.
 TRANSMITTANCE = "material.transmittance"
@@ -35,8 +36,8 @@ class Program:
     weights: F32
 
 
-def program_of(material: Material, syntax: Syntax) -> Program:
-    """The shader of a material.
+def program_of(material: Material, syntax: Syntax, *, sampled: bool = False) -> Program:
+    """The shader of a material; with its sampler where that is wanted.
 
     Raises
     ------
@@ -51,13 +52,17 @@ def program_of(material: Material, syntax: Syntax) -> Program:
     if material.transmittance is not None:
         levels = enumerate(material.transmittance.levels)
         tensors |= {f"{TRANSMITTANCE}.{s}": texels for s, texels in levels}
-    code = Code(syntax, tensors, {*read, last}, _moving(operations))
+    sampler = material.sampler if sampled else None
+    if sampler is not None:
+        tensors |= {name: t.numpy() for name, t in sampler.tensors.items()}
+    code = Code(syntax, tensors, {*read, last, SAMPLER}, _moving(operations))
     values = {
         name: Value.of(name if name.startswith("omega") else f"seen.{name}", size, name == "omega_i")
         for name, size in INPUTS.items()
     }
-    sizes = sizes_of(operations)
-    for op in operations:
+    more = [] if sampler is None else sampler.operations
+    sizes = sampler_sizes(operations, more)
+    for op in [*operations, *more]:
         code.lit = op.output in lit
         found = SHADER[op](op, code, *op.arguments(lambda name, part: values[name][part]))
         results = found if isinstance(found, tuple) else (found,)
@@ -90,8 +95,15 @@ def program_of(material: Material, syntax: Syntax) -> Program:
     ]
     # WebGL has no empty uniforms.
     weights = np.concatenate(code.weights or [np.zeros((1, 4), np.float32)])
-    if code.lobe is not None:
-        text += ["#define SAMPLED_LOBE", f"float4 sampled_lobe(Seen seen) {{ return {code.lobe}; }}"]
+    if sampler is not None:
+        x = values[SAMPLER]
+        bounds = zip(("LEAST_ALPHA", "LARGEST_LOG", "LARGEST_WEIGHT"), BOUNDS, strict=True)
+        text += [
+            "#define SAMPLER",
+            *(f"CONSTANT float {name} = {number(bound)};" for name, bound in bounds),
+            f"float3 sampler_scales(Seen seen) {{ return {x[0:3]}; }}",
+            f"float3 sampler_slopes(Seen seen) {{ return {x[3:6]}; }}",
+        ]
     return Program("\n".join(text), [*code.images.values()], weights)
 
 

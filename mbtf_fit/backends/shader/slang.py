@@ -29,7 +29,7 @@ def module_of(material: Material) -> tuple[str, F32]:
     ------
     InputError : it has an operation that shaders do not have
     """
-    program = program_of(material, SLANG)
+    program = program_of(material, SLANG, sampled=True)
     places, first, buffer = buffer_of(program.images, program.weights)
     least = material.description["data"].get("min_cos", DEFAULT_MIN_COS)
     own = [

@@ -3,27 +3,35 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
 import numpy as np
 import pytest
+import torch
 from support.chi_square import Cap, chi_square_test
 from support.fit_data import random_directions
-from support.plugin_materials import write_material
+from support.plugin_materials import TRAINING, write_material
 from support.plugin_scenes import interaction, plane
 from support.scenes import mi
 
 from mbtf_core.data.lattice import Lattice
+from mbtf_core.directions import from_projected_disk
 from mbtf_core.stats import Estimate, t_test
-from mbtf_fit.backends.mitsuba.lobes import LobeTextures, Mixture, SlopeLobe, fit_lobes
+from mbtf_fit.backends.mitsuba.evaluator import Evaluator
+from mbtf_fit.backends.mitsuba.mixture import Mixture, SlopeLobe
+from mbtf_fit.backends.mitsuba.stored_material import read_material
+from mbtf_fit.config import FitConfig
+from mbtf_fit.material.material import export
+from mbtf_fit.ops import Lobe, Lookup, Operation, Transform
+from mbtf_fit.pytorch.material import NeuralMaterial
+from mbtf_fit.training import sampler as training
 
 COUNT = 32
 
 
 def random_mixture(random: np.random.Generator, viewer: np.ndarray, width: int) -> Mixture:
-    """A random mixture of fitted lobes: any width, tilt, shear and weight."""
+    """A random mixture: any width, tilt, shear and weight."""
     l11, l22 = np.exp(random.uniform(np.log(0.05), np.log(1.0), 2))
     l21, x, y = random.normal(0, 0.3, 3)
     lanes = [mi.Float(np.full(width, v, np.float32)) for v in (l11, l21, l22, x, y)]
@@ -59,65 +67,70 @@ def test_samples_have_the_stated_density() -> None:
     assert np.median(p) > 0.1, p
 
 
-class Glossy:
-    """An evaluator of a known BRDF: a GGX facet distribution, tilted and anisotropic, on a Lambert base."""
+def test_distillation_has_the_density_of_the_plugin() -> None:
+    """Of random mixtures, and its own lights have the density that it states."""
+    random = np.random.default_rng(0)
+    outputs = torch.tensor(random.normal([-1, 0, -1, 0, 0, 0], 0.5, (8, 6)).astype(np.float32))
+    views = torch.tensor(random_directions(random, 8)).float()[:, None]
+    lobe, count = training.LightMixture.of(outputs), 1 << 14
+    light, density = lobe.sample(views, count, torch.Generator().manual_seed(0))
+    above = density > 0
+    solid = torch.where(above, 1 / density, 0).double()
+    deviation = (solid.mean(1) - 2 * np.pi) / (solid.std(1) / count**0.5)
+    assert deviation.abs().max() < 4.5
+    light = torch.where(above[..., None], light, views)
+    x, wo = (np.repeat(a.numpy(), count, 0).T for a in (outputs, views[:, 0]))
+    mixture = Mixture.of([mi.Float(v) for v in x], mi.Vector3f(wo))
+    expected = np.array(mixture.density(mi.Vector3f(light.view(-1, 3).T.numpy())))
+    np.testing.assert_allclose(lobe.density(light, views).flatten(), expected, rtol=2e-3)
 
+
+# A tilted GGX surface: base color, F0, α², slopes.
+BASE, F0, ALPHA, TILT = 0.05, 0.5, 0.15, (0.2, -0.1)
+
+
+def distilled(folder: Path, texel: tuple[float, ...], *value: Operation) -> Path:
+    """A material of a constant texel, with its sampler."""
     lattice = Lattice(1)
-    alphas, tilt, base = (0.1, 0.25), (0.2, -0.1), 0.05
-
-    def lobe(self) -> SlopeLobe:
-        return SlopeLobe(*(mi.Float(v) for v in (self.alphas[0], 0.0, self.alphas[1], *self.tilt)))
-
-    def stage1(self, u: Any, level: Any, viewer: Any) -> Any:
-        return viewer
-
-    def value(self, viewer: Any, light: Any) -> Any:
-        # Half of the lobe's own density over the cosine: energy one half.
-        return mi.Color3f(self.base / dr.pi + 0.5 * self.lobe().density(light, viewer) / light.z)
+    model = NeuralMaterial(lattice, [Lookup("texel", "u", "level", "map", len(texel)), *value])
+    model.texture("map").texels.data[:] = torch.tensor(texel)
+    sampler = training.distill(model, 1 << 24, 0.1, 0)
+    stated = {"hash": "0" * 64, "min_cos": 0.1}
+    export(model, FitConfig(), folder, data=stated, training=TRAINING, sampler=sampler)
+    return folder
 
 
-def second_moment(value: Any, mixture: Mixture, n: int) -> tuple[float, float]:
-    """(mean, variance) of the estimate of ∫ f cos by a mixture's samples."""
-    light = mixture.sample(*uniform(n, 5))
-    above = light.z > 0
-    light = dr.select(above, light, mi.Vector3f(0, 0, 1))
-    ratio = dr.select(above, value(light) * light.z / mixture.density(light), 0.0)
-    x = np.array(ratio, np.float64)
-    return float(x.mean()), float(x.var())
+def estimates(folder: Path, view: np.ndarray, sampling: str, n: int = 1 << 15) -> np.ndarray:
+    """Estimates (n,) of the light that is reflected under a constant sky."""
+    own = {"type": "mbtf", "material": str(folder), "networks": "cooperative", "sampling": sampling}
+    si = interaction(n, tuple(map(float, view)), uv=mi.Point2f(0.3, 0.6))
+    _, weight = mi.load_dict(own).sample(mi.BSDFContext(), si, *uniform(n, 5))
+    return np.array(weight, np.float64).mean(0)
 
 
-def test_the_fit_lobes_a_known_material_are_found() -> None:
-    """Its parameters, and a variance far below the cosine's."""
-    glossy: Any = Glossy()
-    levels = fit_lobes(glossy)
-    assert [level.shape for level in levels] == [(1, 1, 8), (2, 2, 8)]
-    found = np.mean([texel for level in levels for texel in level.reshape(-1, 8)], 0)
-    np.testing.assert_allclose(found[[0, 2]], Glossy.alphas, rtol=0.25)
-    np.testing.assert_allclose(found[3:5], Glossy.tilt, atol=0.05)
-    assert abs(found[1]) < 0.05
-    assert found[5:].min() > 0.5
-    n = 1 << 16
-    textures = LobeTextures(levels)
-    for direction in random_directions(np.random.default_rng(4), 4):
-        viewer = mi.Vector3f(*(mi.Float(np.full(n, c, np.float32)) for c in direction))
-
-        def value(light: Any, viewer: Any = viewer) -> Any:
-            return glossy.value(viewer, light).x
-
-        at = textures.at(mi.Point2f(0.3, 0.6), mi.Float(0.0), viewer)
-        mean, variance = second_moment(value, at, n)
-        flat_mean, flat = second_moment(value, Mixture.cosine(viewer), n)
-        assert abs(mean - flat_mean) < 4 * ((flat + variance) / n) ** 0.5
-        assert variance < flat / 4
+def test_the_sampler_of_a_known_surface(tmp_path: Path) -> None:
+    """Its reflection has the slopes of the surface, no bias, and a variance far below that of the cosine."""
+    texel = (BASE,) * 3 + (F0, ALPHA**2, *TILT)
+    lobe = Lobe("value", "texel[0:3]", "texel[3:4]", "texel[4:5]", "texel[5:7]", "omega_i", "omega_o")
+    distilled(tmp_path, texel, lobe)
+    evaluator = Evaluator(read_material(tmp_path), "cooperative")
+    for direction in from_projected_disk([[0.1, 0.0], [-0.4, 0.3], [0.2, -0.7]]):
+        view = mi.Vector3f(*map(float, direction))
+        mixture = evaluator.mixture(evaluator.stage1(mi.Point2f(0.3, 0.6), mi.Float(0.5), view), view)
+        found = mixture.lobe
+        np.testing.assert_allclose([found.l11[0], found.l22[0]], ALPHA, rtol=0.3)
+        np.testing.assert_allclose([found.x[0], found.y[0]], TILT, atol=0.06)
+        both = [estimates(tmp_path, direction, sampling) for sampling in ("network", "cosine")]
+        own, flat = (Estimate(x.mean(), x.std() / len(x) ** 0.5, len(x), len(x) - 1.0) for x in both)
+        assert t_test(own, flat).p_value > 1e-3
+        assert own.error < flat.error / 2
 
 
-def test_a_lambert_material_keeps_the_cosine() -> None:
-    evaluator: Any = SimpleNamespace(
-        lattice=Lattice(2),
-        stage1=lambda u, level, viewer: {},
-        value=lambda values, light: mi.Color3f(0.2),
-    )
-    assert np.concatenate([level[..., 5:].ravel() for level in fit_lobes(evaluator)]).max() == 0
+def test_a_lambert_material_keeps_the_cosine(tmp_path: Path) -> None:
+    distilled(tmp_path, (0.2,) * 3, Transform("value", "texel"))
+    found = estimates(tmp_path, np.array([0.6, 0.0, 0.8]), "network")
+    assert found.mean() == pytest.approx(0.2 * np.pi, rel=1e-2)
+    assert found.std() < 0.1 * found.mean()
 
 
 @pytest.fixture(scope="module", params=["neumip", "relief"])
@@ -125,7 +138,8 @@ def folder(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     out = tmp_path_factory.mktemp("material")
     # The highlights of `relief` are those of the known surface.
     brightness = {"neumip": 0.5, "relief": 0.1}[request.param]
-    write_material(out, model=request.param, finest=3, aspect=0.7, contrast=0.3, brightness=brightness)
+    shape = {"finest": 3, "aspect": 0.7, "contrast": 0.3, "brightness": brightness}
+    write_material(out, model=request.param, sampled=True, **shape)
     return out
 
 
@@ -143,7 +157,7 @@ def test_weights_are_value_over_density_of_the_same_directions(side: int, folder
     bs, weight = bsdf.sample(context, si, *uniform(n, 3))
     kept = np.array(bs.pdf) > 0
     # A tilted lobe has samples below the surface.
-    assert kept.mean() > 0.7
+    assert kept.mean() > 0.5
     value, pdf = bsdf.eval_pdf(context, si, bs.wo)
     np.testing.assert_allclose(np.array(pdf)[kept], np.array(bs.pdf)[kept], rtol=2e-3)
     np.testing.assert_allclose(np.array(bsdf.pdf(context, si, bs.wo)), np.array(pdf), rtol=1e-5)

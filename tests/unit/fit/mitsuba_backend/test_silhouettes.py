@@ -297,7 +297,7 @@ def holes(coefficient: float) -> Transmittance:
     return Transmittance(Lattice(3), [np.full((2**k, 2**k, 6), coefficient, np.float32) for k in range(4)])
 
 
-@pytest.mark.parametrize("sampling", ["lobes", "cosine"])
+@pytest.mark.parametrize("sampling", ["network", "cosine"])
 def test_samples_are_those_of_value_and_density(sampling: str, tmp_path: Path) -> None:
     """Where some rays miss the heights, and others pass holes."""
     two = {"relief": {"places": 2}}

@@ -20,6 +20,7 @@ from support.scenes import mi
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
+from mbtf_fit.material.material import Material
 from mbtf_fit.surface.heightfield import HeightfieldTracer
 
 assert mi.variant()
@@ -166,6 +167,33 @@ def test_operations_without_their_tensors_are_refused(
     next(op for op in description["operations"] if op["operation"] == operation).update(changes)
     path.write_text(json.dumps(description))
     with pytest.raises(InputError, match=fault) as caught:
+        Evaluator(read_material(tmp_path))
+    check_message(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "tensors", "fault"),
+    [
+        ({"x": ["omega_i"]}, {}, "'omega_i', which depends on the light"),
+        ({"outputs": 5}, {}, "has no 6 outputs"),
+        ({"operation": "guess"}, {}, "is unknown: 'guess'"),
+        ({"hidden": [16, 17]}, {}, "does not fit the sampler"),
+        ({}, {"sampler.1.bias": None}, "does not fit the sampler"),
+    ],
+)
+def test_samplers_that_do_not_fit_are_refused(
+    changes: dict[str, Any], tensors: dict[str, None], fault: str, tmp_path: Path
+) -> None:
+    assert write_material(tmp_path, sampled=True).sampler is not None
+    replace_tensors(tmp_path, dict(tensors))
+    path = tmp_path / "material.json"
+    description = json.loads(path.read_text())
+    description["sampler"][-1].update(changes)
+    path.write_text(json.dumps(description))
+    with pytest.raises(InputError, match=fault) as caught:
+        Material.load(tmp_path)
+    check_message(caught.value)
+    with pytest.raises(InputError) as caught:
         Evaluator(read_material(tmp_path))
     check_message(caught.value)
 

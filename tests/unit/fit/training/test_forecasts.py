@@ -202,7 +202,7 @@ def test_a_long_fit_states_time_and_size(
     out = tmp_path / "material"
     assert run(app, [str(shards), "--time", "2min", "-o", str(out)]) == 130
     # Loading and evaluation are included, and take longer where other work leaves less.
-    assert "expected: about 2:10, " in capsys.readouterr().err
+    assert "expected: about 2:16, " in capsys.readouterr().err
     assert run(app, [str(shards), "--time", "20s", "-o", str(out)]) == 130
     assert "expected" not in capsys.readouterr().err
     monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e4))
