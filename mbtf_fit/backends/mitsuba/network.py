@@ -30,6 +30,8 @@ from mbtf_gen.engine.types import Float
 Layers = list[tuple[F32, F32]]
 # Most weights of unrolled networks: larger ones take too long to compile.
 MOST_UNROLLED = 12_000
+# Outputs of a layer that are summed at a time: their sums do not wait for each other, and fit registers.
+INTERLEAVED = 8
 
 
 def default_arithmetic(stored: StoredMaterial) -> Arithmetic:
@@ -96,13 +98,16 @@ class PackedNetwork:
     def _unrolled(self, inputs: Sequence[Float]) -> Numbers:
         x = list(inputs)
         for k, (weight, bias) in enumerate(self.layers[: self._single]):
-            y = []
-            for row, b in zip(weight.tolist(), bias.tolist(), strict=True):
-                total = mi.Float(b)
-                for value, w in zip(x, row, strict=True):
-                    total = dr.fma(value, w, total)
-                y.append(total if k == len(self.layers) - 1 else self._activated(total))
-            x = y
+            y: Numbers = []
+            for first in range(0, len(weight), INTERLEAVED):
+                part = slice(first, first + INTERLEAVED)
+                totals = [mi.Float(b) for b in bias[part].tolist()]
+                for value, column in zip(x, weight[part].T.tolist(), strict=True):
+                    # Instructions of later scopes follow those of earlier ones.
+                    dr.detail.new_scope(dr.backend_v(mi.Float))
+                    totals = [dr.fma(value, w, total) for total, w in zip(totals, column, strict=True)]
+                y += totals
+            x = y if k == len(self.layers) - 1 else [self._activated(value) for value in y]
         return x
 
     def _cooperative(self, inputs: Sequence[Float]) -> Numbers:
