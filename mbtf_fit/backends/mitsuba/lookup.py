@@ -79,12 +79,10 @@ def _trace(op: ops.Trace, loader: Loader) -> Step:
     shell = shell_of(op, loader)
 
     def step(u: Numbers, level: Numbers, omega_o: Numbers) -> tuple[Numbers, Numbers]:
-        total, hits = mi.Float(0.0), []
-        for at in shell.places(u, level[0], omega_o):
-            z = shell.flat_height(at, omega_o)
-            hits += displaced(at, z, omega_o, shell.aspect)
-            total += z
-        return [total / len(op.places)], hits
+        places = list(shell.places(u, level[0], omega_o))
+        heights = shell.flat_heights(places, omega_o)
+        hits = [displaced(at, z, omega_o, shell.aspect) for at, z in zip(places, heights, strict=True)]
+        return [sum(heights) / len(heights)], [x for hit in hits for x in hit]
 
     return step
 

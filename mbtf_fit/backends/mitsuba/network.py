@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -30,6 +29,8 @@ from mbtf_gen.engine.types import Float
 Layers = list[tuple[F32, F32]]
 # Most weights of unrolled networks: larger ones take too long to compile.
 MOST_UNROLLED = 12_000
+# Outputs of a layer that are summed at a time: their sums do not wait for each other, and fit registers.
+INTERLEAVED = 8
 
 
 def default_arithmetic(stored: StoredMaterial) -> Arithmetic:
@@ -87,22 +88,26 @@ class PackedNetwork:
         x = self._unrolled(inputs)
         return x if self._single == len(self.layers) else self._cooperative(x)
 
-    def _activated(self, x: Any) -> Any:
-        """Activation of a number per lane, or of a cooperative vector where it is ``relu``."""
-        if self.activation == "relu":
-            return dr.maximum(x, 0.0)
-        return dr.sin(x) if self.activation == "sine" else dr.maximum(x, LEAK * x)
+    def _activated(self, x: Float) -> Float:
+        """Activation of a number per lane."""
+        if self.activation == "sine":
+            return dr.sin(x)
+        # A single instruction in place of the four of `dr.maximum`, which looks for NaN.
+        return dr.select(x < 0.0, 0.0 if self.activation == "relu" else LEAK * x, x)
 
     def _unrolled(self, inputs: Sequence[Float]) -> Numbers:
         x = list(inputs)
         for k, (weight, bias) in enumerate(self.layers[: self._single]):
-            y = []
-            for row, b in zip(weight.tolist(), bias.tolist(), strict=True):
-                total = mi.Float(b)
-                for value, w in zip(x, row, strict=True):
-                    total = dr.fma(value, w, total)
-                y.append(total if k == len(self.layers) - 1 else self._activated(total))
-            x = y
+            y: Numbers = []
+            for first in range(0, len(weight), INTERLEAVED):
+                part = slice(first, first + INTERLEAVED)
+                totals = [mi.Float(b) for b in bias[part].tolist()]
+                for value, column in zip(x, weight[part].T.tolist(), strict=True):
+                    # Instructions of later scopes follow those of earlier ones.
+                    dr.detail.new_scope(dr.backend_v(mi.Float))
+                    totals = [dr.fma(value, w, total) for total, w in zip(totals, column, strict=True)]
+                y += totals
+            x = y if k == len(self.layers) - 1 else [self._activated(value) for value in y]
         return x
 
     def _cooperative(self, inputs: Sequence[Float]) -> Numbers:
@@ -112,7 +117,7 @@ class PackedNetwork:
         for k in range(count):
             x = nn.matvec(self._views[2 * k], x, self._views[2 * k + 1])
             if k < count - 1:
-                x = self._activated(x) if self.activation == "relu" else nn.CoopVec(*map(self._activated, x))
+                x = dr.maximum(x, 0.0) if self.activation == "relu" else nn.CoopVec(*map(self._activated, x))
         return [mi.Float(value) for value in x]
 
 

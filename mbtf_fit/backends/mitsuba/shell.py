@@ -13,9 +13,10 @@ import drjit as dr
 import mitsuba as mi
 
 from mbtf_fit.backends.mitsuba.arcs import Arc, tilt, trace_arcs
+from mbtf_fit.backends.mitsuba.view_rays import heights_below
 from mbtf_fit.ops import Trace
 from mbtf_gen.engine.types import Float, Mask, Point2f, Ray3f, Vector2f, Vector3f
-from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry, closest_height
+from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
 # Largest depth of a shell in radii of curvature: sharper edges are traced as if they were that round.
 DEEPEST = 0.5
@@ -112,10 +113,12 @@ class Shell:
                 u[1] + sigma * ((y * along.y + x * along.x) / self.aspect),
             ]
 
-    def flat_height(self, u: Sequence[Float], omega_o: Sequence[Float], active: Mask = True) -> Float:
+    def flat_heights(
+        self, places: Sequence[Sequence[Float]], omega_o: Sequence[Float], active: Mask = True
+    ) -> list[Float]:
         """Heights at which rays through points of a plane meet the heights."""
-        ray = self.ray(u, mi.Float(0.0), -mi.Vector3f(*omega_o))
-        return closest_height(self.heightfield, ray, self.op.crossings, active)
+        rays = [self.ray(u, mi.Float(0.0), -mi.Vector3f(*omega_o)) for u in places]
+        return heights_below(self.heightfield, rays, self.op.crossings, active)
 
     def ray(self, u: Sequence[Float], z: Float, d: Vector3f) -> Ray3f:
         """Rays over a plane, from a height over points of it, as they are traced to the heights."""
@@ -139,9 +142,9 @@ class Shell:
         arc = Arc.of(-omega_o, curvature, self.depth, float(self.op.crossings))
         lowest = clamped(omega_o, min_cos)
         found = []
-        for at in self.places(u, level, lowest):
+        places = list(self.places(u, level, lowest))
+        for at, over_plane in zip(places, self.flat_heights(places, lowest, flat), strict=True):
             hit, s, z = trace_arcs(self.heightfield, mi.Point2f(*at), arc, self.aspect, ~flat)
-            over_plane = self.flat_height(at, lowest, flat)
             place = [
                 dr.select(flat, a, dr.fma(s, b, c))
                 for a, b, c in zip(

@@ -7,7 +7,6 @@ channels padded to a multiple of :data:`GROUP`, so that wide loads read a texel.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -61,13 +60,18 @@ class Textures:
     def blended(self, u: Point2f, level: Float, group: UInt32 | None = None) -> list[Float]:
         """Features between two levels: (1 - frac(level)) of the coarser, frac(level) of the finer one; of one
         group of four channels where its number is given."""
-        out: list[Any] = [0.0] * (self.channels if group is None else GROUP)
-        if len(self.shapes) == 1:
-            return self._level(u, mi.UInt32(0), mi.Float(1.0), out, group)
+        channels = self.channels if group is None else GROUP
         coarse, weight = self._coarse(level)
-        # A level of weight 0 is read where the other one is, from the same cache lines.
-        low = self._level(u, dr.select(weight < 1.0, coarse, coarse + 1), 1.0 - weight, out, group)
-        return self._level(u, dr.select(weight > 0.0, coarse + 1, coarse), weight, low, group)
+        low = self._level(u, coarse, 1.0 - weight, [0.0] * channels, group)
+        if len(self.shapes) == 1:
+            return low
+        # Packets of lanes at whole levels, as where the finest one is magnified, read one level.
+        return dr.if_stmt(
+            (u, coarse, weight, low, group),
+            weight > 0.0,
+            lambda u, coarse, weight, low, group: self._level(u, coarse + 1, weight, low, group),
+            lambda u, coarse, weight, low, group: low,
+        )
 
     def side_by_side(self, u: Point2f, level: Float) -> list[Float]:
         """The same two terms, concatenated: that of the even level, then that of the odd one."""
@@ -75,15 +79,16 @@ class Textures:
         if len(self.shapes) == 1:
             return [*self.first(u), *(mi.Float(v) for v in none)]
         coarse, weight = self._coarse(level)
-        low, high = self._level(u, coarse, 1.0 - weight, none), self._level(u, coarse + 1, weight, none)
+        finer = dr.minimum(coarse + 1, len(self.shapes) - 1)
+        low, high = self._level(u, coarse, 1.0 - weight, none), self._level(u, finer, weight, none)
         odd = (coarse & 1) == 1
         both = list(zip(low, high, strict=True))
         return [dr.select(odd, h, v) for v, h in both] + [dr.select(odd, v, h) for v, h in both]
 
     def _coarse(self, level: Float) -> tuple[UInt32, Float]:
-        """(coarser level, weight of the finer one)."""
+        """(coarser level, weight of the finer one), which is 0 at whole levels."""
         level = dr.clip(level, 0.0, len(self.shapes) - 1.0)
-        coarse = dr.minimum(mi.UInt32(level), len(self.shapes) - 2)
+        coarse = dr.minimum(mi.UInt32(level), len(self.shapes) - 1)
         return coarse, level - mi.Float(coarse)
 
     def _level(

@@ -245,7 +245,7 @@ def _step(
     return state
 
 
-def _surface(
+def surface_within_cell(
     heightfield: HeightField, state: TraversalState, constants: RayConstants, d: Vector3f
 ) -> SurfaceInteraction3f:
     """Surface interactions of lanes whose ray hits the surface within the cell."""
@@ -323,7 +323,7 @@ def _search(
             segment, segment_constants = start_traversal(heightfield, ray, searching, below)
             segment.crossings = state.crossings
             state = _follow(heightfield, segment, segment_constants, max_crossings)
-            si = _surface(heightfield, state, segment_constants, ray.d)
+            si = surface_within_cell(heightfield, state, segment_constants, ray.d)
             searching = state.hit & (rng.chance() >= holes.opacity(si))
             state.hit &= ~searching
             ray.o = dr.select(searching, heightfield.leave(si, ray.d).o, ray.o)
@@ -348,7 +348,7 @@ class HeightfieldGeometry(HeightField):
     ) -> tuple[SurfaceInteraction3f, UInt32, Mask, Any]:
         """First intersections of rays; only those with two-sided height fields may start below."""
         state, constants, rng = _search(self, ray, active, max_crossings, below, holes, rng)
-        return _surface(self, state, constants, ray.d), state.crossings, state.capped, rng
+        return surface_within_cell(self, state, constants, ray.d), state.crossings, state.capped, rng
 
     def occluded(
         self,
@@ -376,7 +376,7 @@ class HeightfieldGeometry(HeightField):
         state, constants = start_traversal(self, ray, active, below)
         shadow, shadow_constants = start_traversal(self, shadow_ray, shadow_active, shadow_below)
         state, shadow = _follow_two(self, state, constants, shadow, shadow_constants, max_crossings)
-        hit = _surface(self, state, constants, ray.d)
+        hit = surface_within_cell(self, state, constants, ray.d)
         return hit, state.capped, shadow.hit | shadow.capped, shadow.capped
 
 
@@ -385,4 +385,4 @@ def closest_height(heightfield: HeightField, ray: Ray3f, max_crossings: int, act
     than `max_crossings` borders of the tile, the height there."""
     state, constants = start_traversal(heightfield, ray, mi.Bool(active), mi.Bool(False))
     state = _follow(heightfield, state, constants, max_crossings)
-    return dr.select(state.hit, _surface(heightfield, state, constants, ray.d).p.z, state.z)
+    return dr.select(state.hit, surface_within_cell(heightfield, state, constants, ray.d).p.z, state.z)

@@ -85,9 +85,10 @@ def test_half_precision_errs_by_less_than_one_percent(options: dict[str, Any], t
 
 
 @pytest.mark.parametrize("cosine", [0.3, 1e-2, 1e-4])
-def test_lines_that_pass_many_tiles_end_as_in_the_fit(cosine: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize("columns", [12, 16])
+def test_lines_that_pass_many_tiles_end_as_in_the_fit(columns: int, cosine: float, tmp_path: Path) -> None:
     """The surface is so deep that the lowest ones reach the cap on crossings: against PyTorch and the cap."""
-    heights = rough_heights(8, 12, depth=3.0)
+    heights = rough_heights(8, columns, depth=3.0)
     write_material(tmp_path, model="relief", aspect=0.75, weights={"surface.heights": tensor(heights)})
     plugin = Evaluator(read_material(tmp_path), "cooperative")
     random = np.random.default_rng(6)
@@ -105,7 +106,7 @@ def test_lines_that_pass_many_tiles_end_as_in_the_fit(cosine: float, tmp_path: P
         capped = borders > 63
         assert capped.mean() > 0.9
         assert borders.max() < 67
-        end = u + (found / cosine)[:, None] * view[:, :2] / [1, 0.75] - 0.5 / np.array([12, 8])
+        end = u + (found / cosine)[:, None] * view[:, :2] / [1, 0.75] - 0.5 / np.array([columns, 8])
         assert np.quantile(np.abs(end - np.round(end)).min(1)[capped], 0.98) < 1e-3
 
 
