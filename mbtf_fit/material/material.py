@@ -44,7 +44,7 @@ from mbtf_fit.material.transmittance import (
     write_transmittance,
 )
 from mbtf_fit.ops import read_operations
-from mbtf_fit.ops.sampler import SAMPLER
+from mbtf_fit.ops.operation import SAMPLER
 from mbtf_fit.pytorch.material import NeuralMaterial
 
 

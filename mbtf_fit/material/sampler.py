@@ -10,8 +10,8 @@ from typing import Any
 from torch import Tensor
 
 from mbtf_fit.ops import Network, Operation
-from mbtf_fit.ops.operation import input_sizes
-from mbtf_fit.ops.sampler import SAMPLER, read_sampler, sampler_sizes
+from mbtf_fit.ops.operation import SAMPLER, input_sizes
+from mbtf_fit.ops.sampler import read_sampler, sampler_sizes
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Sampler:
         """
         if SAMPLER not in description:
             return None
-        found = read_sampler(description[SAMPLER], operations)
+        found = read_sampler(description[SAMPLER], operations, tensors)
         mine = {name: tensor.float() for name, tensor in tensors.items() if is_of_sampler(name)}
         sizes = sampler_sizes(operations, found)
         for op in found:

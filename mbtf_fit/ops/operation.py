@@ -48,6 +48,8 @@ NetworkName = Annotated[str, "network"]
 # Values that every list starts from, and their sizes.
 INPUTS = {"u": 2, "level": 1, "omega_i": 3, "omega_o": 3}
 
+# Name of a material's sampler, of its network and tensors, and the start of the names of its values.
+SAMPLER = "sampler"
 # Most operations of a list that is read.
 _MOST_OPERATIONS = 1000
 
@@ -280,10 +282,17 @@ def sizes_of(operations: Sequence[Operation]) -> dict[str, int]:
 
     Raises
     ------
-    ValueError : an operation reads an unknown value, or one of a wrong size, or a value is computed twice
+    ValueError : an operation reads an unknown value, or one of a wrong size, or a value is computed twice, or
+        has a name of the sampler
     """
     sizes = dict(INPUTS)
     for operation in operations:
+        tensors = [n for kind in ("tensor", "texture", "network") for n in operation.named(kind)]
+        for name in [*output_names(operation), *tensors]:
+            if name.startswith(SAMPLER):
+                raise ValueError(
+                    f"'{name}': names that start with '{SAMPLER}' are those of importance sampling"
+                )
         found = operation.results(input_sizes(operation, sizes))
         again = next((name for name in found if name in sizes), None)
         if again is not None:

@@ -19,13 +19,14 @@ of the reflection, with the constants below. A mixture keeps some cosine, so eve
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mbtf_fit.ops.constants import MAP_CHANNELS
 from mbtf_fit.ops.lookup import Displace, Offset, SurfaceMaps, Trace
 from mbtf_fit.ops.network import Network
 from mbtf_fit.ops.operation import (
+    SAMPLER,
     Operation,
     input_sizes,
     output_names,
@@ -37,8 +38,6 @@ from mbtf_fit.ops.operation import (
 from mbtf_fit.ops.shade import Shade
 from mbtf_fit.ops.value import Calibrate
 
-# Name of the network, and before its tensors.
-SAMPLER = "sampler"
 HIDDEN, OUTPUTS = (16, 16), 6
 # (S2) Smallest α, ε, as values are blurred by the light; largest logarithm m; largest weight w.
 LEAST_ALPHA, LARGEST_LOG, LARGEST_WEIGHT = BOUNDS = 0.02, 3.0, 0.98
@@ -70,20 +69,17 @@ def sampler_of(operations: Sequence[Operation], channels: int) -> list[Operation
     return out
 
 
-def read_sampler(data: Any, operations: Sequence[Operation]) -> list[Operation]:
-    """The operations of a sampler from plain data, for a material of other operations.
+def read_sampler(data: Any, operations: Sequence[Operation], tensors: Mapping[str, Any]) -> list[Operation]:
+    """The operations of a sampler from plain data, for a material of other operations and of arrays by name.
 
     Raises
     ------
     ValueError : they are none of :func:`sampler_of`
     """
+    maps = next((tensors.get(f"{op.maps}.0") for op in operations if isinstance(op, Shade)), None)
     out = parse_operations(data)
-    lit = {name for op in stages(operations)[1] for name in output_names(op)} | {"omega_i"}
-    found = {parse(reference)[0] for op in out for reference in op.inputs()} & lit
-    if found:
-        raise ValueError(f"the sampler reads '{min(found)}', which depends on the light")
-    if sampler_sizes(operations, out).get(SAMPLER) != OUTPUTS:
-        raise ValueError(f"the sampler has no {OUTPUTS} outputs")
+    if out != sampler_of(operations, 0 if maps is None else maps.shape[-1]):
+        raise ValueError("its sampler is not that of its operations")
     return out
 
 

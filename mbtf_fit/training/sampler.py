@@ -25,14 +25,16 @@ from mbtf_fit import ops
 from mbtf_fit.material.inference import predict
 from mbtf_fit.material.reference_values import one_thread_each
 from mbtf_fit.material.sampler import Sampler
-from mbtf_fit.ops.sampler import LARGEST_LOG, LARGEST_WEIGHT, LEAST_ALPHA, SAMPLER, sampler_of
+from mbtf_fit.ops.operation import SAMPLER
+from mbtf_fit.ops.sampler import LARGEST_LOG, LARGEST_WEIGHT, LEAST_ALPHA, sampler_of
 from mbtf_fit.pytorch.material import NeuralMaterial, read_values
 from mbtf_fit.pytorch.networks import Mlp, initialize_layers
 
 # Most queries of a round, and lights of each; a fit has fewer where it was shorter.
 QUERIES, LIGHTS = 1 << 13, 32
-# Evaluations, as a share of the training queries of a fit.
-SHARE = 1 / 8
+# Evaluations, as a share of the training queries of a fit; fewest queries of a round: of fewer, a network is
+# worse than the cosine.
+SHARE, LEAST = 1 / 8, 512
 ROUNDS, STEPS, BATCH, LEARNING_RATE = 2, 300, 512, 1e-2
 # The reflection at the start, which half of the directions are of.
 FIRST_ALPHA = 0.4
@@ -133,10 +135,10 @@ def distill(model: NeuralMaterial, training: int, min_cos: float, seed: int) -> 
     Returns
     -------
     Sampler or None
-        None of a black material, and of one that reads a neighborhood.
+        None of a black material, of one that reads a neighborhood, and after a few steps.
     """
     count = min(QUERIES, int(SHARE * training) // (ROUNDS * LIGHTS))
-    if count == 0 or model.margin:
+    if count < LEAST or model.margin:
         return None
     channels = 0 if model.surface is None else model.surface.maps[0].shape[-1]
     operations = sampler_of(model.stored_operations(), channels)
@@ -145,7 +147,7 @@ def distill(model: NeuralMaterial, training: int, min_cos: float, seed: int) -> 
     random = np.random.Generator(np.random.Philox(key=[0x73616D70, seed]))
     generator = torch.Generator().manual_seed(seed)
     queries = _queries(model, count, min_cos, random)
-    inputs = _inputs(model, operations, *queries)
+    inputs = sampler_inputs(model, operations, *queries)
     mean, deviation = inputs.mean(0), inputs.std(0, correction=0)
     # What is constant but for rounding stays so.
     deviation = torch.where(deviation > 1e-4 * (1.0 + mean.abs()), deviation, 1.0)
@@ -153,7 +155,7 @@ def distill(model: NeuralMaterial, training: int, min_cos: float, seed: int) -> 
     for k in range(ROUNDS):
         if k:
             queries = _queries(model, count, min_cos, random)
-            inputs = _inputs(model, operations, *queries)
+            inputs = sampler_inputs(model, operations, *queries)
         samples = _draw(model, network, (inputs - mean) / deviation, queries, min_cos, generator)
         if not samples.mean2.sum() > 0:
             return None
@@ -178,7 +180,7 @@ def _queries(
     return u.astype(np.float32), sigma.astype(np.float32), views.astype(np.float32)
 
 
-def _inputs(model: NeuralMaterial, operations: list[ops.Operation], *queries: F32) -> Tensor:
+def sampler_inputs(model: NeuralMaterial, operations: list[ops.Operation], *queries: F32) -> Tensor:
     """Inputs (queries, inputs) of the network."""
     *before, network = operations
     assert isinstance(network, ops.Network)

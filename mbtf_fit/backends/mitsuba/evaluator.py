@@ -17,8 +17,8 @@ from mbtf_fit.backends.mitsuba.stored_material import F32, StoredMaterial
 from mbtf_fit.backends.mitsuba.textures import Textures
 from mbtf_fit.material.format import DESCRIPTION_NAME
 from mbtf_fit.ops import Gate, Operation, Shade, Trace, stages
-from mbtf_fit.ops.operation import output_names, parse
-from mbtf_fit.ops.sampler import SAMPLER, sampler_sizes
+from mbtf_fit.ops.operation import SAMPLER, output_names, parse
+from mbtf_fit.ops.sampler import sampler_sizes
 from mbtf_gen.engine.types import Color3f, Float, Point2f, Vector3f
 
 # Values by name.
@@ -93,7 +93,9 @@ class Evaluator:
         sampler."""
         if not self._sampler:
             return Mixture.cosine(viewer)
-        return Mixture.of(_run(self._sampler, values)[SAMPLER], viewer)
+        # Which density a sample is of is not differentiable: gradients through its direction would be biased.
+        with dr.suspend_grad():
+            return Mixture.of(_run(self._sampler, dict(values))[SAMPLER], viewer)
 
     def transmittance(self, u: Point2f, level: Float, omega_o: Vector3f) -> Float:
         """Transparent fraction of the footprint for unit vectors on either side of the plane, equal for

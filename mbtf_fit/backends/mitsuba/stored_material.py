@@ -24,6 +24,7 @@ from mbtf_fit.material.format import (
 )
 from mbtf_fit.material.transmittance import read_transmittance
 from mbtf_fit.ops import Operation, read_operations
+from mbtf_fit.ops.operation import SAMPLER
 from mbtf_fit.ops.sampler import read_sampler
 
 F32 = NDArray[np.float32]
@@ -95,10 +96,11 @@ def read_material(folder: str | Path) -> StoredMaterial:
     description, weights = read_description(folder)
     try:
         operations = read_operations(description["operations"])
-        sampler = read_sampler(description["sampler"], operations) if "sampler" in description else []
+        tensors = read_weights(weights, "np")
+        found = description.get(SAMPLER)
+        sampler = [] if found is None else read_sampler(found, operations, tensors)
     except ValueError as error:
         raise InputError(str(error), where=folder / DESCRIPTION_NAME, hint=AGAIN) from None
-    tensors = read_weights(weights, "np")
     transmittance = read_transmittance(folder, description)
     return StoredMaterial(
         folder,

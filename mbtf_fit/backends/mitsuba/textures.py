@@ -65,10 +65,11 @@ class Textures:
         low = self._level(u, coarse, 1.0 - weight, [0.0] * channels, group)
         if len(self.shapes) == 1:
             return low
-        # Packets of lanes at whole levels, as where the finest one is magnified, read one level.
+        # Packets of lanes at whole levels, as where the finest one is magnified, read one level. The condition is
+        # as wide as what it selects, as one level may be that of all positions.
         return dr.if_stmt(
             (u, coarse, weight, low, group),
-            weight > 0.0,
+            (weight > 0.0) & (u.x == u.x),
             lambda u, coarse, weight, low, group: self._level(u, coarse + 1, weight, low, group),
             lambda u, coarse, weight, low, group: low,
         )

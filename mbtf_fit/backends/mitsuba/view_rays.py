@@ -28,7 +28,7 @@ from mbtf_gen.tile.tracers.heightfield_tracer import (
 # Tile lengths along each axis that rays are traced.
 LONGEST = 2
 # Distance along each axis that the ray's block is ahead of it, as a share of the tile.
-_AHEAD = 2.0**-21
+_AHEAD = 2.0**-20
 # Levels of the first block below that of the displacement range.
 _FINER = 2
 

@@ -12,8 +12,8 @@ from mbtf_fit.backends.shader.backend import SHADER, Code, Value
 from mbtf_fit.backends.shader.images import F32, TexelImage
 from mbtf_fit.backends.shader.syntax import Syntax, number
 from mbtf_fit.material.material import Material
-from mbtf_fit.ops.operation import INPUTS, output_names, parse, reached_from
-from mbtf_fit.ops.sampler import BOUNDS, SAMPLER, sampler_sizes
+from mbtf_fit.ops.operation import INPUTS, SAMPLER, output_names, parse, reached_from
+from mbtf_fit.ops.sampler import BOUNDS, sampler_sizes
 
 # Image of its coefficients.
 TRANSMITTANCE = "material.transmittance"

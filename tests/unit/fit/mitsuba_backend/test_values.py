@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 import torch
@@ -22,6 +23,7 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit.material.material import Material
 from mbtf_fit.surface.heightfield import HeightfieldTracer
+from mbtf_fit.training.sampler import LightMixture, sampler_inputs
 
 assert mi.variant()
 
@@ -172,13 +174,53 @@ def test_operations_without_their_tensors_are_refused(
     check_message(caught.value)
 
 
+@pytest.mark.parametrize("wide", range(4))
+def test_one_lane_stands_for_all(wide: int, tmp_path: Path) -> None:
+    """Position, level, view or light alone has many lanes: a schedule of several sizes ends the process."""
+    write_material(tmp_path, model="relief")
+    plugin = Evaluator(read_material(tmp_path), "cooperative")
+    at, n = [[0.3, 0.6], [1.37], [0.48, 0.36, 0.8], [0.6, 0.0, 0.8]], 8
+    lanes = [[dr.opaque(mi.Float, x, n if k == wide else 1) for x in v] for k, v in enumerate(at)]
+    u, omega_o, omega_i = mi.Point2f(lanes[0]), mi.Vector3f(lanes[2]), mi.Vector3f(lanes[3])
+    found = np.array(plugin.value(plugin.stage1(u, lanes[1][0], omega_o), omega_i)).T
+    query = (np.array([x], np.float32) for x in (at[0], 0.5 * 2.0**-1.37, at[3], at[2]))
+    wanted = Material.load(tmp_path).evaluate(*query)
+    np.testing.assert_allclose(found, np.tile(wanted, (n, 1)), rtol=1e-3)
+
+
+@pytest.mark.parametrize("model", ["neumip", "relief"])
+def test_the_plugin_has_the_mixtures_of_pytorch(model: str, tmp_path: Path) -> None:
+    """Also where a surface of random maps varies with position and level; no gradients through them, which
+    would be biased."""
+    stored = write_material(tmp_path, model=model, sampled=True, contrast=1.0)
+    sampler = stored.sampler
+    assert sampler is not None
+    plugin = Evaluator(read_material(tmp_path), "cooperative")
+    u, sigma, _, view = random_queries(np.random.default_rng(2), 300, stored.lattice).values()
+    inputs = sampler_inputs(stored.model, sampler.operations, u, sigma, view)
+    layers = [sampler.tensors[f"sampler.{k}.{n}"] for k in range(3) for n in ("weight", "bias")]
+    x = inputs
+    for k, (weight, bias) in enumerate(zip(layers[::2], layers[1::2], strict=True)):
+        x = torch.nn.functional.linear(x, weight, bias)
+        x = x.relu() if k < 2 else x
+    wanted = LightMixture.of(x)
+    level = np.clip(-np.log2(2 * sigma), 0, stored.lattice.finest)
+    omega = mi.Vector3f(view.T)
+    values = plugin.stage1(mi.Point2f(u.T), mi.Float(level), omega)
+    found = plugin.mixture(values, omega)
+    for name in ("l11", "l21", "l22", "x", "y"):
+        expected = getattr(wanted, name)[:, 0].detach()
+        np.testing.assert_allclose(np.array(getattr(found.lobe, name)), expected, rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(np.array(found.weight), wanted.weight[:, 0].detach(), rtol=1e-3, atol=1e-4)
+
+
 @pytest.mark.parametrize(
     ("changes", "tensors", "fault"),
     [
-        ({"x": ["omega_i"]}, {}, "'omega_i', which depends on the light"),
-        ({"outputs": 5}, {}, "has no 6 outputs"),
+        ({"x": ["omega_i"]}, {}, "is not that of its operations"),
+        ({"outputs": 5}, {}, "is not that of its operations"),
+        ({"weights": "decoder"}, {}, "is not that of its operations"),
         ({"operation": "guess"}, {}, "is unknown: 'guess'"),
-        ({"hidden": [16, 17]}, {}, "does not fit the sampler"),
         ({}, {"sampler.1.bias": None}, "does not fit the sampler"),
     ],
 )
