@@ -65,8 +65,8 @@ class Textures:
         low = self._level(u, coarse, 1.0 - weight, [0.0] * channels, group)
         if len(self.shapes) == 1:
             return low
-        # Packets of lanes at whole levels, as where the finest one is magnified, read one level. The condition is
-        # as wide as what it selects, as one level may be that of all positions.
+        # Packets of lanes at whole levels, as where the finest one is magnified, read one level. The
+        # condition has the lanes of what it selects: one level may be that of many positions.
         return dr.if_stmt(
             (u, coarse, weight, low, group),
             (weight > 0.0) & (u.x == u.x),
