@@ -16,6 +16,7 @@ from mbtf_fit.ops.value import calibrated
 from mbtf_fit.pytorch.networks import InceptionDecoder, Mlp, initialize_layers
 from mbtf_fit.pytorch.operations import FUNCTIONS, PYTORCH, Execution, displacement
 from mbtf_fit.pytorch.textures import FeatureTextures
+from mbtf_fit.pytorch.values import aligned, read_value, shaped
 from mbtf_fit.surface.hints import compute_hints
 from mbtf_fit.surface.known import KnownSurface
 
@@ -148,10 +149,10 @@ class NeuralMaterial(nn.Module):
         """The given values, and those of some operations."""
         run, values = Execution(self, grid), dict(given)
         for op in operations:
-            read = op.arguments(lambda name, part: _read(values, name, part))
-            arguments: list[object] = [*map(_shaped, op.value_fields(), read)]
+            read = op.arguments(lambda name, part: read_value(values, name, part))
+            arguments: list[object] = [*map(shaped, op.value_fields(), read)]
             if not isinstance(op, ops.Inception):
-                arguments = _aligned(arguments)
+                arguments = aligned(arguments)
             found = PYTORCH[op](op, run, *arguments)
             found = (found,) if isinstance(found, Tensor) else found
             values.update(zip(output_names(op), found, strict=True))
@@ -426,40 +427,3 @@ def _first_outputs(operations: Sequence[ops.Operation]) -> dict[str, dict[int, f
                 first = part.start or 0
                 out[source.weights] = {first + k: start for k in range(count)}
     return out
-
-
-def _read(values: Mapping[str, Tensor], name: str, part: slice) -> Tensor:
-    """Some numbers of a value; all of them as they are."""
-    return values[name] if part == slice(None) or values[name].ndim == 1 else values[name][:, part]
-
-
-def read_values(values: Mapping[str, Tensor], references: Sequence[str]) -> Tensor:
-    """Values (n, numbers), concatenated."""
-    found = (_shaped("x", _read(values, *parse(reference))) for reference in references)
-    return torch.cat([x for x in found if isinstance(x, Tensor)], 1)
-
-
-def _shaped(field: str, argument: Tensor | list[Tensor] | None) -> object:
-    """What a field reads, with the shapes of :mod:`mbtf_fit.pytorch.operations`."""
-    if isinstance(argument, list):
-        return [_shaped(field, item) for item in argument]
-    if argument is None or (argument.ndim == 1) == (field == "level"):
-        return argument
-    return argument[:, 0] if field == "level" else argument[:, None]
-
-
-def _aligned(arguments: list[object]) -> list[object]:
-    """The same with as many rows each: those of queries are repeated for their positions."""
-    tensors = [t for a in arguments for t in (a if isinstance(a, list) else [a]) if isinstance(t, Tensor)]
-    rows = max(map(len, tensors))
-    if all(len(t) == rows for t in tensors):
-        return arguments
-
-    def repeated(argument: object) -> object:
-        if isinstance(argument, list):
-            return [repeated(item) for item in argument]
-        if isinstance(argument, Tensor) and len(argument) < rows:
-            return argument.repeat_interleave(rows // len(argument), 0)
-        return argument
-
-    return [repeated(argument) for argument in arguments]

@@ -27,8 +27,9 @@ from mbtf_fit.material.reference_values import one_thread_each
 from mbtf_fit.material.sampler import Sampler
 from mbtf_fit.ops.operation import SAMPLER
 from mbtf_fit.ops.sampler import LARGEST_LOG, LARGEST_WEIGHT, LEAST_ALPHA, sampler_of
-from mbtf_fit.pytorch.material import NeuralMaterial, read_values
+from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.pytorch.networks import Mlp, initialize_layers
+from mbtf_fit.pytorch.values import read_values
 
 # Most queries of a round, and lights of each; a fit has fewer where it was shorter.
 QUERIES, LIGHTS = 1 << 13, 32
@@ -184,7 +185,6 @@ def sampler_inputs(model: NeuralMaterial, operations: list[ops.Operation], *quer
     """Inputs (queries, inputs) of the network."""
     *before, network = operations
     assert isinstance(network, ops.Network)
-
     device = next(model.parameters()).device
     with torch.no_grad():
         first = model.stage1(*(torch.from_numpy(a).to(device) for a in queries))
