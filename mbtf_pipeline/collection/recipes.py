@@ -269,7 +269,8 @@ class PaperRecipe(Collection):
 
 
 def load(file: Path, assignments: Sequence[str] = ()) -> Recipe | LibraryRecipe | PaperRecipe:
-    """Read a recipe of any kind: of a paper if it lists ``tables``, of a library if it has ``library``.
+    """Read a recipe of any kind: of a library if it has ``library``, of a paper if it lists ``tables`` or
+    ``materials``.
 
     Parameters
     ----------
@@ -286,10 +287,10 @@ def load(file: Path, assignments: Sequence[str] = ()) -> Recipe | LibraryRecipe 
         An assignment is invalid.
     """
     keys = read_recipe(file) if file.is_file() else {}
-    if "tables" in keys:
-        return resolve(PaperRecipe, file=file, assignments=assignments, read=read_recipe)
     if "library" in keys:
         return resolve(LibraryRecipe, file=file, assignments=assignments, read=read_recipe)
+    if keys.keys() & {"tables", "materials"}:
+        return resolve(PaperRecipe, file=file, assignments=assignments, read=read_recipe)
     return load_recipe(file, assignments)
 
 

@@ -82,6 +82,7 @@ def test_faults_of_the_recipe(folder: Path) -> None:
         (f"library: [{'x' * 300}]\n" + BASE, "is not a valid file name"),
         ("library: [more/empty]\n" + BASE, "names no material"),
         ("library: [assets]\nbase:\n  generate:\n    querys: {}\n", r"base: unknown key 'generate\.querys'"),
+        ("materials: {rock: assets/cliff_rock}\n" + BASE, "key 'tables' is missing"),
         ("library: [assets]\nbase:\n  each_fit: {trainig: {}}\n", r"base: .*'fit\.relief\.trainig'"),
     ):
         with pytest.raises(InputError, match=what):
