@@ -27,6 +27,8 @@ from mbtf_core.data.verify import verify
 from mbtf_gen.planning.simulation import ClosedForm
 from mbtf_gen.render.estimates import Estimates, Stream
 
+# Between others, the files stay as they are: a kill leaves what one at the next of these does.
+CHANGES = {"write", "pwrite", "ftruncate", "replace", "link", "unlink", "mkdir"}
 ERRORS = (errno.EIO, errno.ENOSPC, errno.EACCES, errno.EMFILE)
 PARTIAL_OR_INPUT = (3, 4)
 
@@ -102,7 +104,7 @@ def alike(operation: Operation) -> Operation:
 
 
 def operations(line: list[str], small: Small, prepare: Callable[[], None], thorough: bool) -> list[Operation]:
-    """What a command does below the folder; where not `thorough`, one of every third sort."""
+    """What a command does below the folder; where not `thorough`, one of each sort."""
     prepare()
     with FileOperations(small.out) as watch:
         assert generate(line) == 0
@@ -111,7 +113,7 @@ def operations(line: list[str], small: Small, prepare: Callable[[], None], thoro
     if thorough:
         return watch.seen
     # The last of a sort comes after others of its kind are finished.
-    return list({alike(operation): operation for operation in watch.seen}.values())[::3]
+    return list({alike(operation): operation for operation in watch.seen}.values())
 
 
 COMMANDS = {
@@ -138,7 +140,8 @@ def test_any_file_operation_may_fail(
     prepare, line_of = COMMANDS[name]
     line = line_of(small)
     refused = 0
-    for index, operation in enumerate(operations(line, small, lambda: prepare(small), thorough)):
+    found = operations(line, small, lambda: prepare(small), thorough)
+    for index, operation in enumerate(found if thorough else found[::4]):
         for number in ERRORS if thorough else (ERRORS[index % len(ERRORS)],):
             prepare(small)
             capsys.readouterr()
@@ -174,6 +177,8 @@ def test_a_kill_at_any_file_operation_loses_nothing(name: str, thorough: bool, s
     line = line_of(small)
     killed = 0
     for operation in operations(line, small, lambda: prepare(small), thorough):
+        if operation[0] not in CHANGES:
+            continue
         prepare(small)
 
         def kill(now: Operation, at: Operation = operation) -> None:
