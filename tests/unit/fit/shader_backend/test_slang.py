@@ -22,32 +22,38 @@ from mbtf_fit.material.format import QUERY
 class Device:
     """Slang's CPU device with a module."""
 
-    def __init__(self, module: str, folder: Path) -> None:
+    def __init__(self, module: str, folder: Path, **defines: str) -> None:
         spy = pytest.importorskip("slangpy", reason="no slangpy; to enable: pip install 'mbtf[shaders]'")
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "material.slang").write_text(module)
         self._spy = spy
-        options = {"include_paths": [str(folder)]}
+        options = {"include_paths": [str(folder)], "defines": defines}
+        self._stride = 8 if "#define HALF_TEXELS" in module else 16
+        self._names = ["material_texels"] + ["material_weights"] * ("COOPERATIVE" in defines)
         self._device = spy.Device(type=spy.DeviceType.cpu, compiler_options=options)
         self._kernels: dict[str, Any] = {}
 
     def buffer(self, array: np.ndarray) -> Any:
-        usage = self._spy.BufferUsage
-        return self._device.create_buffer(
-            size=array.nbytes,
-            struct_size=4 * array.shape[-1] if array.ndim > 1 else 4,
-            usage=usage.shader_resource | usage.unordered_access,
-            data=np.ascontiguousarray(array, np.float32),
-        )
+        data = np.ascontiguousarray(array, np.float32)
+        return self._buffer(data, 4 * array.shape[-1] if array.ndim > 1 else 4)
 
-    def values(self, texels: np.ndarray, queries: tuple[Any, ...]) -> np.ndarray:
+    def _buffer(self, data: np.ndarray, stride: int) -> Any:
+        usage = self._spy.BufferUsage
+        usage = usage.shader_resource | usage.unordered_access
+        return self._device.create_buffer(size=data.nbytes, struct_size=stride, usage=usage, data=data)
+
+    def numbers(self, content: bytes) -> dict[str, Any]:
+        """The module's buffer, by the names it is bound to."""
+        return dict.fromkeys(self._names, self._buffer(np.frombuffer(bytearray(content), np.uint8), self._stride))
+
+    def values(self, texels: bytes, queries: tuple[Any, ...]) -> np.ndarray:
         """Values and transmittance (n, 4) of queries."""
         u, sigma, omega_i, omega_o = queries
         numbers = np.concatenate([u, sigma[:, None], omega_i, omega_o], 1)
         inputs = {
             "query_count": len(u),
             "queries": self.buffer(numbers.reshape(-1)),
-            "material_texels": self.buffer(texels),
+            **self.numbers(texels),
         }
         return self.run(ENTRY, len(u), 4, inputs, "values")
 
@@ -147,7 +153,7 @@ def test_lights_are_sampled_by_their_density(case: str, tmp_path: Path) -> None:
     device = Device(module + SAMPLING, tmp_path / "module")
     view = from_angles(50.0, 30.0).astype(np.float32)
     random, count = np.random.default_rng(0), 1 << 16
-    shared = {"material_texels": device.buffer(texels), "view": view.tolist(), "query_count": count}
+    shared = {**device.numbers(texels), "view": view.tolist(), "query_count": count}
 
     def call(entry: str, numbers: np.ndarray) -> np.ndarray:
         inputs = {**shared, "random_numbers": device.buffer(numbers.astype(np.float32).reshape(-1))}
