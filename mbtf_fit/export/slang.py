@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from pydantic import Field
-
 from typing import Literal
+
+from pydantic import Field
 
 from mbtf_core.config.settings import Settings
 from mbtf_core.errors import UsageError
@@ -20,8 +20,8 @@ class ShaderOptions(Settings):
     )
     shader_networks: Literal["plain", "cooperative"] | None = Field(
         None,
-        description="networks of the other language: loops, or cooperative vectors in half precision; the module "
-        "has both",
+        description="networks of the other language: loops, or cooperative vectors in half precision, as the "
+        "module has both",
     )
 
 
@@ -34,8 +34,10 @@ def write(export: Export, options: ShaderOptions) -> list[str]:
     cooperative = options.shader_networks == "cooperative"
     without = [target for target in targets if target in PLAIN_TARGETS]
     if cooperative and without:
-        hint = "leave one of the two out"
-        raise UsageError(f"Slang has no cooperative vectors for {without[0]}", where="--shader-networks", hint=hint)
+        hint = "export that language by a command of its own"
+        raise UsageError(
+            f"Slang has no cooperative vectors for {without[0]}", where="--shader-networks", hint=hint
+        )
     check_shaders(export.material, export.folder / MODULE_NAME)
     return write_module(export.material, export.folder, targets, half=export.half, cooperative=cooperative)
 

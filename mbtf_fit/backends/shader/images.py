@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from mbtf_core.height_planes import node_table
 from mbtf_fit.ops.shade import adjacent_azimuths
 
-F16, F32 = NDArray[np.float16], NDArray[np.float32]
+F16 = NDArray[np.float16]
+F32 = NDArray[np.float32]
 # What the texels of an image are: channels as they are stored; filtered maps; horizons, of which neighbors
 # lie side by side; nodes of a height field; rows of three numbers. The last two are tables.
 Layout = Literal["plain", "maps", "horizons", "nodes", "rows"]
@@ -99,8 +100,8 @@ def _halves(numbers: F32) -> F16:
 
 
 def half_rows(matrix: F32) -> F16:
-    """A matrix as cooperative vectors read it: its rows begin at multiples of 16 bytes, and it takes multiples
-    of 64, as VK_NV_cooperative_vector asks."""
+    """A matrix as cooperative vectors read it (VK_NV_cooperative_vector): its rows begin at multiples of 16
+    bytes, and it takes multiples of 64."""
     rows, columns = matrix.shape
     padded = np.zeros((rows + -rows % 4, columns + -columns % 8), np.float32)
     padded[:rows, :columns] = matrix

@@ -1,8 +1,7 @@
 """Fully connected networks in shaders: loops over vectors of four and, in Slang, cooperative vectors.
 
-Both are in the same module, under ``#ifdef COOPERATIVE``. Cooperative vectors are in half precision. The first
-layer stays in single precision, as rounded inputs would cause most of the error, and so do networks that move
-lookups, as values are sensitive to errors of the position.
+Both are in the same module, under ``#ifdef COOPERATIVE``. Cooperative vectors are in half precision. Networks
+that move lookups stay in single precision, as values are sensitive to errors of the position.
 """
 
 from __future__ import annotations
@@ -29,25 +28,24 @@ def _network(op: ops.Network, code: Code, x: Sequence[Value]) -> Value:
     names = [f"{op.weights}.{n}" for n in range(len(op.hidden) + 1)]
     layers = [(code.tensors[f"{name}.weight"], code.tensors[f"{name}.bias"]) for name in names]
     out = code.variable("float4", op.output, -(-op.outputs // 4))
-    cooperative = code.syntax.cooperative and len(layers) > 1 and op.weights not in code.precise
-    if cooperative:
-        h = _loops(code, layers[:1], ACTIVATIONS[op.activation], h)
+    loops = ACTIVATIONS[op.activation]
+    if not code.syntax.cooperative or op.weights in code.precise:
+        _loops(code, layers, loops, h, out)
+    else:
         code.write("#ifdef COOPERATIVE")
-        _cooperative_vectors(code, layers[1:], COOPERATIVE[op.activation], h, out)
+        _cooperative_vectors(code, layers, COOPERATIVE[op.activation], read, out)
         code.write("#else")
-    _loops(code, layers[1 if cooperative else 0 :], ACTIVATIONS[op.activation], h, out)
-    if cooperative:
+        _loops(code, layers, loops, h, out)
         code.write("#endif")
     return Value.of_array(out, op.outputs, code.lit)
 
 
-def _loops(code: Code, layers: Layers, activation: str, h: str, out: str = "") -> str:
-    """Write layers that read an array of vectors; the array of their outputs, `out` for the last one, without
-    activation, if there is one."""
+def _loops(code: Code, layers: Layers, activation: str, h: str, out: str) -> None:
+    """Write layers from an array of vectors to another one."""
     for n, (weight, bias) in enumerate(layers):
         first, (outputs, inputs) = sum(map(len, code.weights)), (-(-size // 4) for size in weight.shape)
         code.weights.append(layer_vectors(weight, bias))
-        last = n == len(layers) - 1 and out != ""
+        last = n == len(layers) - 1
         y = out if last else code.variable("float4", "h", outputs, kept=False)
         # Unrolled code is slower in software rendering, and takes long to compile.
         code.write(
@@ -64,19 +62,16 @@ def _loops(code: Code, layers: Layers, activation: str, h: str, out: str = "") -
             "}",
         )
         h = y
-    return h
 
 
-def _cooperative_vectors(code: Code, layers: Layers, activation: str, h: str, out: str) -> None:
-    """Write layers from an array of vectors to another one."""
-    inputs, outputs = layers[0][0].shape[1], len(layers[-1][0])
-    x = code.name("v")
-    numbers = ", ".join(Value.of_array(h, inputs).scalars())
-    code.write(f"CoopVec<half, {inputs}> {x} = CoopVec<half, {inputs}>({numbers});")
+def _cooperative_vectors(code: Code, layers: Layers, activation: str, read: Value, out: str) -> None:
+    """Write layers from numbers to an array of vectors."""
+    width, x = len(read), code.name("v")
+    code.write(f"CoopVec<half, {width}> {x} = CoopVec<half, {width}>({', '.join(read.scalars())});")
     for n, (weight, bias) in enumerate(layers):
-        y, width = code.name("v"), len(weight)
+        width, y = len(weight), code.name("v")
         layer = f"layer<{width}>({x}, {code.matrix(weight)}, {code.matrix(bias[None])})"
         found = layer if n == len(layers) - 1 else activation.format(layer)
         code.write(f"CoopVec<half, {width}> {y} = {found};")
         x = y
-    code.fill(out, in_fours([f"float({x}[{k}])" for k in range(outputs)]), outputs)
+    code.fill(out, in_fours([f"float({x}[{k}])" for k in range(width)]), width)

@@ -20,10 +20,12 @@ from mbtf_fit.material.material import Material
 
 MODULE_NAME, TEXELS_NAME = "material.slang", "material.bin"
 ENTRY = "evaluate_queries"
+# What CUDA's half precision needs of Slang's prelude.
+CUDA_HALF = b"#define SLANG_CUDA_ENABLE_HALF 1\n"
 
 
 def module_of(material: Material, *, half: bool = False) -> tuple[str, bytes]:
-    """The module of a material, and its buffer, of vectors of four numbers; whether they are in half precision.
+    """The module of a material, and its buffer; whether that is in half precision.
 
     Raises
     ------
@@ -72,11 +74,12 @@ def write_module(
     write_text(folder / MODULE_NAME, module)
     write_chunks(folder / TEXELS_NAME, [buffer])
     written = [MODULE_NAME, TEXELS_NAME]
+    defined = ["-DCOOPERATIVE"] if cooperative else []
     for target in targets:
         assert compiler is not None
         name = Path(MODULE_NAME).with_suffix(ENDINGS[target]).name
-        defined = ["-DCOOPERATIVE"] if cooperative else []
-        write_chunks(folder / name, [compiler.compile(folder / MODULE_NAME, ENTRY, target, defined)])
+        code = compiler.compile(folder / MODULE_NAME, ENTRY, target, defined)
+        write_chunks(folder / name, [CUDA_HALF, code] if target == "cuda" else [code])
         written.append(name)
     return written
 

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import shutil
+import struct
 import subprocess
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from support.material_cases import CASES, make
 
 from mbtf_core.app.console import run
 from mbtf_core.directions import from_angles
 from mbtf_fit.backends.shader.slang import ENTRY, SlangCompiler, module_of
-from mbtf_fit.backends.shader.syntax import ENDINGS
+from mbtf_fit.backends.shader.syntax import ENDINGS, PLAIN_TARGETS
 from mbtf_fit.cli.app import app
 from mbtf_fit.material.format import QUERY
+from mbtf_fit.material.material import to_half
+from mbtf_fit.ops import Network
+from mbtf_fit.training.sampler import LightMixture, sampler_inputs
 
 
 class Device:
@@ -44,10 +49,11 @@ class Device:
 
     def numbers(self, content: bytes) -> dict[str, Any]:
         """The module's buffer, by the names it is bound to."""
-        return dict.fromkeys(self._names, self._buffer(np.frombuffer(bytearray(content), np.uint8), self._stride))
+        data = np.frombuffer(bytearray(content), np.uint8)
+        return dict.fromkeys(self._names, self._buffer(data, self._stride))
 
-    def values(self, texels: bytes, queries: tuple[Any, ...]) -> np.ndarray:
-        """Values and transmittance (n, 4) of queries."""
+    def values(self, texels: bytes, queries: tuple[Any, ...], entry: str = ENTRY) -> np.ndarray:
+        """Values and transmittance (n, 4) of queries, or what another entry makes of them."""
         u, sigma, omega_i, omega_o = queries
         numbers = np.concatenate([u, sigma[:, None], omega_i, omega_o], 1)
         inputs = {
@@ -55,7 +61,7 @@ class Device:
             "queries": self.buffer(numbers.reshape(-1)),
             **self.numbers(texels),
         }
-        return self.run(ENTRY, len(u), 4, inputs, "values")
+        return self.run(entry, len(u), 4, inputs, "values")
 
     def run(self, entry: str, count: int, width: int, inputs: dict[str, Any], output: str) -> np.ndarray:
         if entry not in self._kernels:
@@ -85,6 +91,32 @@ def test_values_are_those_of_the_material(case: str, tmp_path: Path) -> None:
         through = material.transmittance.evaluate(*(q[k] for k in ("u", "sigma", "omega_o")))
         assert through.std() > 0.1
     np.testing.assert_allclose(found[:, 3], through, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("case", "half", "cooperative"),
+    [
+        ("relief", True, False),
+        ("relief", False, True),
+        ("holes", True, True),
+        ("direct offset, six outputs", True, True),
+        ("concatenated, softplus", False, True),
+    ],
+)
+def test_half_precision(case: str, half: bool, cooperative: bool, tmp_path: Path) -> None:
+    """A buffer of halves holds a rounded material exactly; cooperative vectors round all between layers."""
+    material = make(case, tmp_path / "material")
+    size = len(module_of(material)[1])
+    if half:
+        material, _ = to_half(material)
+    module, texels = module_of(material, half=half)
+    assert (len(texels) < 0.7 * size) == half
+    defines = {"COOPERATIVE": "1"} if cooperative else {}
+    q = material.conformance
+    found = Device(module, tmp_path / "module", **defines).values(texels, tuple(q[name] for name in QUERY))
+    apart = np.abs(found[:, :3] - q["rgb"]) / np.maximum(q["rgb"], q["rgb"].mean())
+    assert (apart.max(1) > (2e-2 if cooperative else 1e-4)).sum() <= 2
+    assert (np.median(apart) > 1e-5) == cooperative
 
 
 RAISING = """
@@ -180,23 +212,80 @@ def test_lights_are_sampled_by_their_density(case: str, tmp_path: Path) -> None:
     assert abs(solid - 2 * np.pi * 0.95) < 5 * error
 
 
-def test_other_languages(tmp_path: Path) -> None:
+DENSITIES = """
+[shader("compute")] [numthreads(64, 1, 1)]
+void densities(uint3 thread : SV_DispatchThreadID) {
+  if (thread.x >= query_count) return;
+  uint k = 9 * thread.x;
+  float3 omega_i = float3(queries[k + 3], queries[k + 4], queries[k + 5]);
+  float3 omega_o = float3(queries[k + 6], queries[k + 7], queries[k + 8]);
+  Seen seen = stage1(float2(queries[k], queries[k + 1]), queries[k + 2], omega_o);
+  values[thread.x] = float4(pdf_light(seen, omega_i, omega_o));
+}
+"""
+
+
+@pytest.mark.parametrize("case", ["relief under a coat", "holes"])
+def test_densities_are_those_of_training(case: str, tmp_path: Path) -> None:
+    """The density of lights, of a random network at random places, is that by which it was trained."""
+    material = make(case, tmp_path / "material", sampled=True)
+    assert material.sampler is not None
+    q, network = material.conformance, material.sampler.operations[-1]
+    assert isinstance(network, Network)
+    x = sampler_inputs(material.model, material.sampler.operations, q["u"], q["sigma"], q["omega_o"])
+    weights, last = material.sampler.tensors, len(network.hidden)
+    for n in range(last + 1):
+        x = x @ weights[f"{network.weights}.{n}.weight"].T + weights[f"{network.weights}.{n}.bias"]
+        x = x.relu() if n < last else x
+    light, view = (torch.from_numpy(q[name])[:, None] for name in ("omega_i", "omega_o"))
+    expected = LightMixture.of(x).density(light, view)[:, 0].numpy()
+    module, texels = module_of(material)
+    queries = tuple(q[name] for name in QUERY)
+    found = Device(module + DENSITIES, tmp_path / "module").values(texels, queries, "densities")[:, 0]
+    assert expected.std() > 0.05
+    assert (np.abs(found - expected) > 1e-4 * np.maximum(expected, 1.0)).sum() <= 2
+
+
+# SPIR-V's OpCapability of VK_NV_cooperative_vector.
+COOPERATIVE_VECTOR = struct.pack("<II", 0x00020011, 5394)
+MARKS = {
+    ".hlsl": b"StructuredBuffer<float4",
+    ".spv": struct.pack("<I", 0x07230203),
+    ".comp": b"#version 450",
+    ".wgsl": b"@compute",
+    ".metal": b"[[kernel]]",
+    ".cu": b"__global__",
+}
+
+
+@pytest.mark.parametrize("more", [[], ["--half", "--shader-networks", "cooperative"]])
+def test_other_languages(
+    more: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("slangpy", reason="no slangpy; to enable: pip install 'mbtf[shaders]'")
+    monkeypatch.setenv("SLANG_RUN_SPIRV_VALIDATION", "1")
     make("relief", tmp_path / "material")
-    words = [word for target in ENDINGS for word in ("--shader-target", target)]
+    targets = [target for target in ENDINGS if not more or target not in PLAIN_TARGETS]
+    words = [word for target in targets for word in ("--shader-target", target)]
     out = tmp_path / "out"
-    command = ["export", str(tmp_path / "material"), "--to", "slang", *words, "-o", str(out), "-q"]
-    assert run(app, command) == 0
+    command = ["export", str(tmp_path / "material"), "--to", "slang", *more, "-o", str(out), "-q"]
+    assert run(app, [*command, *words]) == 0
     before = {path.name: path.read_bytes() for path in out.iterdir()}
-    assert len(before) == 3 + len(ENDINGS)
-    marks = {".hlsl": b"StructuredBuffer<float4", ".comp": b"#version 450", ".wgsl": b"@compute"}
-    marks |= {".metal": b"[[kernel]]", ".cu": b"__global__"}
+    assert len(before) == 3 + len(targets)
+    marks = MARKS | ({".hlsl": b"linalg_MulAdd", ".spv": COOPERATIVE_VECTOR} if more else {})
     for name, text in before.items():
         assert marks.get(Path(name).suffix, b"") in text, name
-    assert run(app, command) == 0
-    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
     if shutil.which("g++"):
         subprocess.run(["g++", "-fsyntax-only", "-w", str(out / "material.cpp")], check=True)
+    if shutil.which("nvcc"):
+        ptx = ["nvcc", "-ptx", "-w", "-o", str(tmp_path / "material.ptx"), str(out / "material.cu")]
+        subprocess.run(ptx, check=True)
+    if not more:
+        assert run(app, [*command, *words]) == 0
+        assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    else:
+        assert run(app, [*command, "--shader-target", "metal", "--overwrite"]) == 2
+        assert "Slang has no cooperative vectors for metal" in capsys.readouterr().err
 
 
 def test_the_documented_function_compiles(tmp_path: Path) -> None:
