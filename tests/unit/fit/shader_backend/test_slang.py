@@ -6,16 +6,16 @@ import shutil
 import struct
 import subprocess
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from support.material_cases import CASES, make
+from support.slang_device import SlangDevice
 
 from mbtf_core.app.console import run
 from mbtf_core.directions import from_angles
-from mbtf_fit.backends.shader.slang import ENTRY, SlangCompiler, module_of
+from mbtf_fit.backends.shader.slang import SlangCompiler, module_of
 from mbtf_fit.backends.shader.syntax import ENDINGS, PLAIN_TARGETS
 from mbtf_fit.cli.app import app
 from mbtf_fit.material.format import QUERY
@@ -23,55 +23,7 @@ from mbtf_fit.material.material import to_half
 from mbtf_fit.ops import Network
 from mbtf_fit.training.sampler import LightMixture, sampler_inputs
 
-
-class Device:
-    """Slang's CPU device with a module."""
-
-    def __init__(self, module: str, folder: Path, **defines: str) -> None:
-        spy = pytest.importorskip("slangpy", reason="no slangpy; to enable: pip install 'mbtf[shaders]'")
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "material.slang").write_text(module)
-        self._spy = spy
-        options = {"include_paths": [str(folder)], "defines": defines}
-        self._stride = 8 if "#define HALF_TEXELS" in module else 16
-        self._names = ["material_texels"] + ["material_weights"] * ("COOPERATIVE" in defines)
-        self._device = spy.Device(type=spy.DeviceType.cpu, compiler_options=options)
-        self._kernels: dict[str, Any] = {}
-
-    def buffer(self, array: np.ndarray) -> Any:
-        data = np.ascontiguousarray(array, np.float32)
-        return self._buffer(data, 4 * array.shape[-1] if array.ndim > 1 else 4)
-
-    def _buffer(self, data: np.ndarray, stride: int) -> Any:
-        usage = self._spy.BufferUsage
-        usage = usage.shader_resource | usage.unordered_access
-        return self._device.create_buffer(size=data.nbytes, struct_size=stride, usage=usage, data=data)
-
-    def numbers(self, content: bytes) -> dict[str, Any]:
-        """The module's buffer, by the names it is bound to."""
-        data = np.frombuffer(bytearray(content), np.uint8)
-        return dict.fromkeys(self._names, self._buffer(data, self._stride))
-
-    def values(self, texels: bytes, queries: tuple[Any, ...], entry: str = ENTRY) -> np.ndarray:
-        """Values and transmittance (n, 4) of queries, or what another entry makes of them."""
-        u, sigma, omega_i, omega_o = queries
-        numbers = np.concatenate([u, sigma[:, None], omega_i, omega_o], 1)
-        inputs = {
-            "query_count": len(u),
-            "queries": self.buffer(numbers.reshape(-1)),
-            **self.numbers(texels),
-        }
-        return self.run(entry, len(u), 4, inputs, "values")
-
-    def run(self, entry: str, count: int, width: int, inputs: dict[str, Any], output: str) -> np.ndarray:
-        if entry not in self._kernels:
-            program = self._device.load_program("material.slang", [entry])
-            self._kernels[entry] = self._device.create_compute_kernel(program)
-        out = self.buffer(np.zeros((count, width), np.float32))
-        self._kernels[entry].dispatch(thread_count=[count, 1, 1], vars={**inputs, output: out})
-        return np.asarray(out.to_numpy().view(np.float32).reshape(count, width))
-
-
+pytest.importorskip("slangpy", reason="no slangpy; to enable: pip install 'mbtf[shaders]'")
 # Each takes seconds to compile: without those whose operations others have.
 SHADED = sorted(CASES.keys() - {"black", "calibrated", "relief", "relief without hints"})
 
@@ -79,9 +31,8 @@ SHADED = sorted(CASES.keys() - {"black", "calibrated", "relief", "relief without
 @pytest.mark.parametrize("case", SHADED)
 def test_values_are_those_of_the_material(case: str, tmp_path: Path) -> None:
     material = make(case, tmp_path / "material")
-    module, texels = module_of(material)
     q = material.conformance
-    found = Device(module, tmp_path / "module").values(texels, tuple(q[name] for name in QUERY))
+    found = SlangDevice(*module_of(material), tmp_path / "module").values(*(q[name] for name in QUERY))
     deviation = np.abs(found[:, :3] - q["rgb"]) / np.maximum(1.0, q["rgb"])
     assert q["rgb"].std() > 0.005
     # A traced ray may miss an edge.
@@ -109,12 +60,12 @@ def test_half_precision(case: str, half: bool, cooperative: bool, tmp_path: Path
     size = len(module_of(material)[1])
     if half:
         material, _ = to_half(material)
-    module, texels = module_of(material, half=half)
-    assert (len(texels) < 0.7 * size) == half
-    defines = {"COOPERATIVE": "1"} if cooperative else {}
+    module, content = module_of(material, half=half)
+    assert (len(content) < 0.7 * size) == half
     q = material.conformance
-    found = Device(module, tmp_path / "module", **defines).values(texels, tuple(q[name] for name in QUERY))
-    apart = np.abs(found[:, :3] - q["rgb"]) / np.maximum(q["rgb"], q["rgb"].mean())
+    device = SlangDevice(module, content, tmp_path / "module", cooperative=cooperative)
+    found = device.evaluate(*(q[name] for name in QUERY))
+    apart = np.abs(found - q["rgb"]) / np.maximum(q["rgb"], q["rgb"].mean())
     assert (apart.max(1) > (2e-2 if cooperative else 1e-4)).sum() <= 2
     assert (np.median(apart) > 1e-5) == cooperative
 
@@ -133,15 +84,14 @@ def test_directions_below_the_plane_and_the_data(tmp_path: Path) -> None:
     """Lights and views below the plane give 0; directions below the smallest cosine are raised to it."""
     material = make("relief", tmp_path / "material")
     least = material.description["data"]["min_cos"] = 0.2
-    module, texels = module_of(material)
-    device = Device(module + RAISING, tmp_path / "module")
+    module, content = module_of(material)
+    device = SlangDevice(module + RAISING, content, tmp_path / "module")
     q, below = material.conformance, np.array([1, 1, -1], np.float32)
     for factors in ((below, 1), (1, below), (np.array([1, 1, 0], np.float32), 1)):
         omega_i, omega_o = q["omega_i"] * factors[0], q["omega_o"] * factors[1]
-        assert (device.values(texels, (q["u"], q["sigma"], omega_i, omega_o))[:, :3] == 0).all()
+        assert (device.evaluate(q["u"], q["sigma"], omega_i, omega_o) == 0).all()
     directions = from_angles(np.array([90.0, 30.0, 10.0, 0.1, -30.0]), np.full(5, 30.0)).astype(np.float32)
-    inputs = {"query_count": 5, "queries": device.buffer(directions.reshape(-1))}
-    found = device.run("raise_directions", 5, 4, inputs, "values")
+    found = device.run("raise_directions", 5, {"queries": directions})
     expected = directions.copy()
     expected[2:4] = from_angles(np.degrees(np.arcsin(least)), 30.0)
     np.testing.assert_allclose(found[:, :3], expected, atol=1e-6)
@@ -181,15 +131,14 @@ def _cells(omega: np.ndarray) -> np.ndarray:
 def test_lights_are_sampled_by_their_density(case: str, tmp_path: Path) -> None:
     """The density integrates to 1, and is that of the samples by their counts in cells."""
     material = make(case, tmp_path / "material", sampled=True)
-    module, texels = module_of(material)
-    device = Device(module + SAMPLING, tmp_path / "module")
+    module, content = module_of(material)
+    device = SlangDevice(module + SAMPLING, content, tmp_path / "module")
     view = from_angles(50.0, 30.0).astype(np.float32)
     random, count = np.random.default_rng(0), 1 << 16
-    shared = {**device.numbers(texels), "view": view.tolist(), "query_count": count}
 
     def call(entry: str, numbers: np.ndarray) -> np.ndarray:
-        inputs = {**shared, "random_numbers": device.buffer(numbers.astype(np.float32).reshape(-1))}
-        return device.run(entry, count, 4, inputs, "samples").astype(np.float64)
+        inputs = {"view": view.tolist(), "random_numbers": numbers}
+        return device.run(entry, count, inputs, output="samples").astype(np.float64)
 
     z = 1 - 2 * (np.arange(count) + 0.5) / count
     angle = np.pi * (1 + np.sqrt(5)) * np.arange(count)
@@ -239,9 +188,9 @@ def test_densities_are_those_of_training(case: str, tmp_path: Path) -> None:
         x = x.relu() if n < last else x
     light, view = (torch.from_numpy(q[name])[:, None] for name in ("omega_i", "omega_o"))
     expected = LightMixture.of(x).density(light, view)[:, 0].numpy()
-    module, texels = module_of(material)
-    queries = tuple(q[name] for name in QUERY)
-    found = Device(module + DENSITIES, tmp_path / "module").values(texels, queries, "densities")[:, 0]
+    module, content = module_of(material)
+    device = SlangDevice(module + DENSITIES, content, tmp_path / "module")
+    found = device.values(*(q[name] for name in QUERY), entry="densities")[:, 0]
     assert expected.std() > 0.05
     assert (np.abs(found - expected) > 1e-4 * np.maximum(expected, 1.0)).sum() <= 2
 
@@ -262,7 +211,6 @@ MARKS = {
 def test_other_languages(
     more: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("slangpy", reason="no slangpy; to enable: pip install 'mbtf[shaders]'")
     monkeypatch.setenv("SLANG_RUN_SPIRV_VALIDATION", "1")
     make("relief", tmp_path / "material")
     targets = [target for target in ENDINGS if not more or target not in PLAIN_TARGETS]
@@ -289,7 +237,6 @@ def test_other_languages(
 
 
 def test_the_documented_function_compiles(tmp_path: Path) -> None:
-    pytest.importorskip("slangpy", reason="no slangpy; to enable: pip install 'mbtf[shaders]'")
     make("relief", tmp_path / "material")
     out = tmp_path / "out"
     assert run(app, ["export", str(tmp_path / "material"), "--to", "slang", "-o", str(out), "-q"]) == 0
