@@ -32,12 +32,11 @@ def write(export: Export, options: ShaderOptions) -> list[str]:
 
     targets = list(dict.fromkeys(options.shader_target or []))
     cooperative = options.shader_networks == "cooperative"
-    without = [target for target in targets if target in PLAIN_TARGETS]
-    if cooperative and without:
-        hint = "export that language by a command of its own"
-        raise UsageError(
-            f"Slang has no cooperative vectors for {without[0]}", where="--shader-networks", hint=hint
-        )
+    if cooperative and not targets:
+        raise UsageError("is for other languages", where="--shader-networks", hint="add --shader-target")
+    if cooperative and (without := [target for target in targets if target in PLAIN_TARGETS]):
+        what = f"Slang has no cooperative vectors for {without[0]}"
+        raise UsageError(what, where="--shader-networks", hint="export that language by a command of its own")
     check_shaders(export.material, export.folder / MODULE_NAME)
     return write_module(export.material, export.folder, targets, half=export.half, cooperative=cooperative)
 

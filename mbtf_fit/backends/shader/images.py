@@ -100,10 +100,10 @@ def _halves(numbers: F32) -> F16:
 
 
 def half_rows(matrix: F32) -> F16:
-    """A matrix as cooperative vectors read it (VK_NV_cooperative_vector): its rows begin at multiples of 16
-    bytes, and it takes multiples of 64."""
+    """A matrix as cooperative vectors read it: rows begin at multiples of 16 bytes, matrices at multiples of
+    128 in HLSL, of 64 in Vulkan."""
     rows, columns = matrix.shape
-    padded = np.zeros((rows + -rows % 4, columns + -columns % 8), np.float32)
+    padded = np.zeros((rows + -rows % 8, columns + -columns % 8), np.float32)
     padded[:rows, :columns] = matrix
     return _halves(padded)
 
@@ -140,7 +140,7 @@ def buffer_of(images: Sequence[TexelImage], weights: F32, matrices: Sequence[F16
         append(texels, not half or image.is_table)
     first = len(content) // size
     append(weights, not half)
-    content.extend(bytes(-len(content) % 64))
+    content.extend(bytes(-len(content) % 128))
     start = len(content)
     for matrix in matrices:
         content.extend(matrix.tobytes())

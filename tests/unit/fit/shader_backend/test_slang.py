@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import struct
 import subprocess
@@ -62,6 +63,11 @@ def test_half_precision(case: str, half: bool, cooperative: bool, tmp_path: Path
         material, _ = to_half(material)
     module, content = module_of(material, half=half)
     assert (len(content) < 0.7 * size) == half
+    # HLSL's alignment of matrices.
+    places = [int(n) for pair in re.findall(r"layer<\d+>\(\w+, (\d+), (\d+)\)", module) for n in pair]
+    places += [int(n) for n in re.findall(r"#define MATRICES (\d+)", module)]
+    assert len(places) > 4
+    assert not any(place % 128 for place in places)
     q = material.conformance
     device = SlangDevice(module, content, tmp_path / "module", cooperative=cooperative)
     found = device.evaluate(*(q[name] for name in QUERY))
@@ -234,6 +240,8 @@ def test_other_languages(
     else:
         assert run(app, [*command, "--shader-target", "metal", "--overwrite"]) == 2
         assert "Slang has no cooperative vectors for metal" in capsys.readouterr().err
+        assert run(app, [*command, "--overwrite"]) == 2
+        assert "add --shader-target" in capsys.readouterr().err
 
 
 def test_the_documented_function_compiles(tmp_path: Path) -> None:
