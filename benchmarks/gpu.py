@@ -12,7 +12,8 @@ One data set of an asset is generated on the CPU. Then follow, each in a process
   and on the device; their test errors agree;
 - **materials** fitted on the CPU: conformance values in PyTorch and by the Mitsuba plugin, unrolled, by
   cooperative vectors and in half precision, milliseconds of a 1080p picture, and a ball that the plugin
-  renders.
+  renders; where slangpy is installed, conformance values of the Slang module by CUDA, and of its cooperative
+  vectors by Vulkan.
 
 A difference passes if it is at most its tolerance plus 4.5 standard errors. Rates are reported only. Without
 a CUDA device, nothing is measured and the exit code is 0. The last line is one JSON object: figures, and the
@@ -25,6 +26,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +49,7 @@ FIT_BEGUN, FIT = 0.05, 0.2
 # Most deviation from conformance values, in single and in half precision.
 SINGLE, HALF = 1e-4, 1e-2
 ARITHMETICS = {"unrolled": SINGLE, "cooperative": SINGLE, "half": HALF}
+SHADERS = {"plain": SINGLE, "cooperative": HALF} if find_spec("slangpy") else {}
 # Environment in which PyTorch replaces the compiled kernel.
 NO_KERNEL = {"MBTF_KERNEL": "off"}
 # Seconds after which a process counts as hanging.
@@ -257,8 +260,11 @@ class Comparison:
             side = _side(number, device)
             ways: dict[str, tuple[str, float, tuple[str, ...]]] = {"PyTorch": ("infer", SINGLE, ())}
             if model != "hierarchical":
-                # The plugin does not support its decoder.
+                # Plugin and shaders do not support its decoder.
                 ways |= {name: ("evaluate_plugin", most, (name,)) for name, most in ARITHMETICS.items()}
+                ways |= {
+                    f"Slang, {name}": ("evaluate_slang", most, (name,)) for name, most in SHADERS.items()
+                }
             for way, (function, most, more) in ways.items():
                 name = f"{model} on {side}, {way}"
                 given = (device, *more, self.sizes.text(), str(folder))

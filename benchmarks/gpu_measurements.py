@@ -7,6 +7,7 @@ are ``cpu`` and ``cuda``.
 from __future__ import annotations
 
 import json
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -229,6 +230,20 @@ def evaluate_plugin(device: str, arithmetic: Any, sizes: str, folder: str) -> An
         dr.sync_thread()
 
     yield {"queries": len(queries.sigma)} | seconds_of(work)
+
+
+def evaluate_slang(device: str, networks: str, sizes: str, folder: str) -> Answers:
+    """The deviation of the Slang module, by CUDA; of its cooperative vectors by Vulkan."""
+    from support.slang_device import SlangDevice
+
+    from mbtf_fit import Material
+    from mbtf_fit.backends.shader.slang import module_of
+
+    material, cooperative = Material.load(folder), networks == "cooperative"
+    kind = "cpu" if device == "cpu" else "vulkan" if cooperative else "cuda"
+    with tempfile.TemporaryDirectory() as module:
+        slang = SlangDevice(*module_of(material), Path(module), cooperative=cooperative, kind=kind)
+        yield {"deviation": conformance_deviation(slang, material)}
 
 
 def render(device: str, sizes: str, folder: str, out: str) -> Answers:

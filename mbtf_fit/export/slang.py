@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from mbtf_core.config.settings import Settings
-from mbtf_fit.backends.shader.syntax import ENDINGS, Target
+from mbtf_core.errors import UsageError
+from mbtf_fit.backends.shader.syntax import ENDINGS, PLAIN_TARGETS, Target
 from mbtf_fit.export import Export, ExportTarget
 
 
@@ -15,6 +18,11 @@ class ShaderOptions(Settings):
     shader_target: list[Target] | None = Field(
         None, description="another language that Slang compiles the module to (extra 'shaders'). Repeatable"
     )
+    shader_networks: Literal["plain", "cooperative"] | None = Field(
+        None,
+        description="networks of the other language: loops, or cooperative vectors in half precision, as the "
+        "module has both",
+    )
 
 
 def write(export: Export, options: ShaderOptions) -> list[str]:
@@ -22,8 +30,15 @@ def write(export: Export, options: ShaderOptions) -> list[str]:
     from mbtf_fit.backends.shader.slang import MODULE_NAME, write_module
     from mbtf_fit.export.checks import check_shaders
 
+    targets = list(dict.fromkeys(options.shader_target or []))
+    cooperative = options.shader_networks == "cooperative"
+    if cooperative and not targets:
+        raise UsageError("is for other languages", where="--shader-networks", hint="add --shader-target")
+    if cooperative and (without := [target for target in targets if target in PLAIN_TARGETS]):
+        what = f"Slang has no cooperative vectors for {without[0]}"
+        raise UsageError(what, where="--shader-networks", hint="export that language by a command of its own")
     check_shaders(export.material, export.folder / MODULE_NAME)
-    return write_module(export.material, export.folder, list(dict.fromkeys(options.shader_target or [])))
+    return write_module(export.material, export.folder, targets, half=export.half, cooperative=cooperative)
 
 
 TARGET = ExportTarget(

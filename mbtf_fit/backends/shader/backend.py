@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any, NamedTuple
 
-from mbtf_fit.backends.shader.images import F32, Layout, TexelImage
+from mbtf_fit.backends.shader.images import F16, F32, Layout, TexelImage, half_rows
 from mbtf_fit.backends.shader.syntax import Syntax
 from mbtf_fit.ops import Backend
 
@@ -96,7 +96,7 @@ class Code:
     syntax : the language
     tensors : of the material, by name
     kept : values of stage 1 that stage 2 reads
-    precise : textures that need single precision, because they move lookups
+    precise : textures and networks that need single precision, because they move lookups
 
     Attributes
     ----------
@@ -106,6 +106,7 @@ class Code:
     lit : whether the current operation depends on the light, so that its code is part of stage 2
     images : by the names of their tensors
     weights : vectors (n, 4) of the networks' layers
+    matrices : those of cooperative vectors
     """
 
     def __init__(
@@ -118,6 +119,7 @@ class Code:
         self.lit = False
         self.images: dict[str, TexelImage] = {}
         self.weights: list[F32] = []
+        self.matrices: list[F16] = []
         self.precise, self._kept = precise, kept
         self._included: set[str] = set()
         self._names = 0
@@ -195,6 +197,12 @@ class Code:
     def scalar(self, tensor: str) -> float:
         """A tensor ()."""
         return float(self.tensors[tensor])
+
+    def matrix(self, matrix: F32) -> int:
+        """Keep a matrix for cooperative vectors; the place of its first byte among them."""
+        first = sum(other.nbytes for other in self.matrices)
+        self.matrices.append(half_rows(matrix))
+        return first
 
     def image(self, source: str, layout: Layout = "plain", half: bool = False) -> TexelImage:
         """The image of a texture, or of one tensor; whether half precision suffices."""

@@ -2,7 +2,8 @@
 
 An image has its levels one below the other, coarsest first, and layers of four channels each. A table has
 one layer. In one buffer of all numbers, texel (x, y) of a layer is vector ``first + (layer · height + y) ·
-width + x``.
+width + x``. In a buffer of half precision, each vector has 8 bytes; those of tables have 16 there too, as
+nodes of height fields are bounds.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from mbtf_core.height_planes import node_table
 from mbtf_fit.ops.shade import adjacent_azimuths
 
+F16 = NDArray[np.float16]
 F32 = NDArray[np.float32]
 # What the texels of an image are: channels as they are stored; filtered maps; horizons, of which neighbors
 # lie side by side; nodes of a height field; rows of three numbers. The last two are tables.
@@ -92,14 +94,54 @@ def layer_vectors(weight: F32, bias: F32) -> F32:
     return padded.reshape(outputs, 4, -1).transpose(0, 2, 1).reshape(-1, 4)
 
 
-def buffer_of(images: Sequence[TexelImage], weights: F32) -> tuple[list[str], int, F32]:
-    """Place (first, width, height) of each image in a buffer of all numbers, first vector of the weights, and
-    the buffer (n, 4)."""
-    places, parts, first = [], [], 0
+def _halves(numbers: F32) -> F16:
+    most = np.finfo(np.float16).max
+    return numbers.clip(-most, most).astype("<f2")
+
+
+def half_rows(matrix: F32) -> F16:
+    """A matrix as cooperative vectors read it: rows begin at multiples of 16 bytes, matrices at multiples of
+    128 in HLSL, of 64 in Vulkan."""
+    rows, columns = matrix.shape
+    padded = np.zeros((rows + -rows % 8, columns + -columns % 8), np.float32)
+    padded[:rows, :columns] = matrix
+    return _halves(padded)
+
+
+@dataclass(frozen=True)
+class Buffer:
+    """All numbers of a shader.
+
+    Attributes
+    ----------
+    content : vectors of four numbers, then matrices of cooperative vectors
+    places : place (first, width, height) of each image
+    weights : first vector of the networks
+    matrices : first byte of the matrices
+    """
+
+    content: bytes
+    places: list[str]
+    weights: int
+    matrices: int
+
+
+def buffer_of(images: Sequence[TexelImage], weights: F32, matrices: Sequence[F16], *, half: bool) -> Buffer:
+    """The buffer of a shader; whether its vectors are in half precision."""
+    places, content, size = [], bytearray(), 8 if half else 16
+
+    def append(numbers: F32, precise: bool) -> None:
+        content.extend((numbers.astype("<f4") if precise else _halves(numbers)).tobytes())
+
     for image in images:
         texels = image.texels()
         _, height, width, _ = texels.shape
-        places.append(f"{first}, {width}, {height}")
-        parts.append(texels.reshape(-1, 4))
-        first += len(parts[-1])
-    return places, first, np.concatenate([*parts, weights])
+        places.append(f"{len(content) // size}, {width}, {height}")
+        append(texels, not half or image.is_table)
+    first = len(content) // size
+    append(weights, not half)
+    content.extend(bytes(-len(content) % 128))
+    start = len(content)
+    for matrix in matrices:
+        content.extend(matrix.tobytes())
+    return Buffer(bytes(content), places, first, start)

@@ -8,13 +8,11 @@ from collections.abc import Sequence
 from mbtf_core.data.schema import CLEARCOAT_F0
 from mbtf_fit import ops
 from mbtf_fit.backends.shader.backend import SHADER, Code, Value, in_fours
-from mbtf_fit.backends.shader.images import layer_vectors
 from mbtf_fit.backends.shader.syntax import number, vector
-from mbtf_fit.ops.constants import COATED_CHANNELS, GLOSSY_CHANNELS, LEAK
+from mbtf_fit.ops.constants import COATED_CHANNELS, GLOSSY_CHANNELS
 from mbtf_fit.ops.shade import grazing_reflectance
 
 PER_WIDTH = "float2(1.0, ASPECT)"
-ACTIVATIONS = {"relu": "max({0}, 0.0)", "leaky-relu": f"max({{0}}, {LEAK} * {{0}})", "sine": "sin({0})"}
 FUNCTIONS = {
     "identity": "{0}",
     "exp": "exp({0})",
@@ -224,35 +222,6 @@ def _frequencies(op: ops.Frequencies, code: Code, x: Value, level: Value | None)
             sines.append(f"{factor}sin({frequency} * {c})")
             cosines.append(f"{factor}cos({frequency} * {c})")
     return in_fours([*(x.scalars() if op.raw else []), *sines, *cosines])
-
-
-@SHADER.implements(ops.Network)
-def _network(op: ops.Network, code: Code, x: Sequence[Value]) -> Value:
-    read = Value(tuple(n for value in x for n in value.numbers))
-    h = code.variable("float4", "h", len(read.vectors()), kept=False)
-    code.fill(h, read.vectors(), len(read))
-    for n in range(len(op.hidden) + 1):
-        weight, bias = (code.tensors[f"{op.weights}.{n}.{name}"] for name in ("weight", "bias"))
-        first, (outputs, inputs) = sum(map(len, code.weights)), (-(-size // 4) for size in weight.shape)
-        code.weights.append(layer_vectors(weight, bias))
-        hidden = n < len(op.hidden)
-        out = code.variable("float4", "h" if hidden else op.output, outputs)
-        # Unrolled code is slower in software rendering, and takes long to compile.
-        code.write(
-            f"for (int o = 0; o < {outputs}; o++) {{",
-            f"  int at = {first} + o * {1 + 4 * inputs};",
-            "  float4 sum = WEIGHT(at);",
-            f"  for (int i = 0; i < {inputs}; i++) {{",
-            f"    float4 x = {h}[i];",
-            "    int k = at + 4 * i;",
-            "    sum += WEIGHT(k + 1) * x.x + WEIGHT(k + 2) * x.y;",
-            "    sum += WEIGHT(k + 3) * x.z + WEIGHT(k + 4) * x.w;",
-            "  }",
-            f"  {out}[o] = {ACTIVATIONS[op.activation].format('sum') if hidden else 'sum'};",
-            "}",
-        )
-        h = out
-    return Value.of_array(h, op.outputs, code.lit)
 
 
 @SHADER.implements(ops.Transform)

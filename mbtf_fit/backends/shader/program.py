@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from mbtf_fit import ops
+from mbtf_fit.backends.shader import network as _networks  # noqa: F401
 from mbtf_fit.backends.shader import operations as _implementations  # noqa: F401
 from mbtf_fit.backends.shader.backend import SHADER, Code, Value
-from mbtf_fit.backends.shader.images import F32, TexelImage
+from mbtf_fit.backends.shader.images import F16, F32, TexelImage
 from mbtf_fit.backends.shader.syntax import Syntax, number
 from mbtf_fit.material.material import Material
 from mbtf_fit.ops.operation import INPUTS, SAMPLER, output_names, parse, reached_from
@@ -29,11 +30,13 @@ class Program:
         ``transmittance(u, sigma, omega_o)``, without the declarations of images
     images : in the order of their declarations
     weights : vectors (n, 4) of the networks
+    matrices : of their cooperative vectors
     """
 
     code: str
     images: list[TexelImage]
     weights: F32
+    matrices: list[F16]
 
 
 def program_of(material: Material, syntax: Syntax, *, sampled: bool = False) -> Program:
@@ -104,14 +107,16 @@ def program_of(material: Material, syntax: Syntax, *, sampled: bool = False) -> 
             f"float3 sampler_scales(Seen seen) {{ return {x[0:3]}; }}",
             f"float3 sampler_slopes(Seen seen) {{ return {x[3:6]}; }}",
         ]
-    return Program("\n".join(text), [*code.images.values()], weights)
+    return Program("\n".join(text), [*code.images.values()], weights, code.matrices)
 
 
 def _moving(operations: list[ops.Operation]) -> set[str]:
-    """Textures whose features move lookups."""
+    """Textures and networks that move lookups."""
     lookups = [op for op in operations if isinstance(op, ops.Lookup)]
+    networks = [op for op in operations if isinstance(op, ops.Network)]
     positions = {parse(op.u)[0] for op in lookups}
-    return {op.textures for op in lookups if positions & reached_from(operations, op.output)}
+    sources = [(op.output, op.textures) for op in lookups] + [(op.output, op.weights) for op in networks]
+    return {name for output, name in sources if positions & reached_from(operations, output)}
 
 
 def _transmittance(material: Material, code: Code, level: str) -> list[str]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from mbtf_core.errors import EngineError, reason
 from mbtf_core.extras import extra_error
 from mbtf_core.files.atomic import write_chunks, write_text
-from mbtf_fit.backends.shader.images import F32, buffer_of
+from mbtf_fit.backends.shader.images import buffer_of
 from mbtf_fit.backends.shader.program import program_of
 from mbtf_fit.backends.shader.syntax import ENDINGS, SLANG, Target, number
 from mbtf_fit.material.format import DEFAULT_MIN_COS
@@ -20,32 +20,49 @@ from mbtf_fit.material.material import Material
 
 MODULE_NAME, TEXELS_NAME = "material.slang", "material.bin"
 ENTRY = "evaluate_queries"
+# What CUDA's half precision needs of Slang's prelude.
+CUDA_HALF = b"#define SLANG_CUDA_ENABLE_HALF 1\n"
 
 
-def module_of(material: Material) -> tuple[str, F32]:
-    """The module of a material, and the vectors (n, 4) of its buffer.
+def module_of(material: Material, *, half: bool = False) -> tuple[str, bytes]:
+    """The module of a material, and its buffer; whether that is in half precision.
 
     Raises
     ------
     InputError : it has an operation that shaders do not have
     """
     program = program_of(material, SLANG, sampled=True)
-    places, first, buffer = buffer_of(program.images, program.weights)
+    buffer = buffer_of(program.images, program.weights, program.matrices, half=half)
     least = material.description["data"].get("min_cos", DEFAULT_MIN_COS)
     own = [
         SLANG.prologue,
-        f"#define WEIGHT(i) material_texels[{first} + (i)]",
+        f"#define WEIGHT(i) vector_at({buffer.weights} + (i))",
         f"CONSTANT float MIN_COS = {number(least)};",
-        *(SLANG.image.format(name=i, place=p) for i, p in zip(program.images, places, strict=True)),
+        *(SLANG.image.format(name=i, place=p) for i, p in zip(program.images, buffer.places, strict=True)),
         program.code,
     ]
     head, tail = files(__package__).joinpath("module.slang").read_text().split("//MATERIAL\n")
     head = head.replace("//MODEL", f"// Model: {material.model.name}.")
-    return head + "\n".join([*own, tail]), buffer
+    defined = ["#define HALF_TEXELS"] * half + [f"#define MATRICES {buffer.matrices}"]
+    head = head.replace("//BUFFER", "\n".join(defined))
+    return head + "\n".join([*own, tail]), buffer.content
 
 
-def write_module(material: Material, folder: Path, targets: Sequence[Target] = ()) -> list[str]:
+def write_module(
+    material: Material,
+    folder: Path,
+    targets: Sequence[Target] = (),
+    *,
+    half: bool = False,
+    cooperative: bool = False,
+) -> list[str]:
     """Write the module, its buffer, and the module in other languages; returns the names of the files.
+
+    Parameters
+    ----------
+    targets : the other languages
+    half : whether the buffer is in half precision
+    cooperative : whether networks are cooperative vectors in the other languages
 
     Raises
     ------
@@ -53,14 +70,16 @@ def write_module(material: Material, folder: Path, targets: Sequence[Target] = (
     EngineError : Slang's compiler is missing
     """
     compiler = SlangCompiler() if targets else None
-    module, buffer = module_of(material)
+    module, buffer = module_of(material, half=half)
     write_text(folder / MODULE_NAME, module)
-    write_chunks(folder / TEXELS_NAME, [buffer.astype("<f4").tobytes()])
+    write_chunks(folder / TEXELS_NAME, [buffer])
     written = [MODULE_NAME, TEXELS_NAME]
+    defined = ["-DCOOPERATIVE"] if cooperative else []
     for target in targets:
         assert compiler is not None
         name = Path(MODULE_NAME).with_suffix(ENDINGS[target]).name
-        write_chunks(folder / name, [compiler.compile(folder / MODULE_NAME, ENTRY, target)])
+        code = compiler.compile(folder / MODULE_NAME, ENTRY, target, defined)
+        write_chunks(folder / name, [CUDA_HALF, code] if target == "cuda" else [code])
         written.append(name)
     return written
 
@@ -91,8 +110,8 @@ class SlangCompiler:
         self._lib.spGetDiagnosticOutput.restype = ctypes.c_char_p
         self._session = ctypes.c_void_p(self._lib.spCreateSession(None))
 
-    def compile(self, module: Path, entry: str, target: Target) -> bytes:
-        """Text of a compute shader in another language.
+    def compile(self, module: Path, entry: str, target: Target, options: Sequence[str] = ()) -> bytes:
+        """A compute shader in another language, with more options of the compiler.
 
         Raises
         ------
@@ -100,7 +119,7 @@ class SlangCompiler:
         """
         request = ctypes.c_void_p(self._lib.spCreateCompileRequest(self._session))
         try:
-            words = [str(module), "-target", target, "-entry", entry, "-stage", "compute"]
+            words = [str(module), "-target", target, "-entry", entry, "-stage", "compute", *options]
             array = (ctypes.c_char_p * len(words))(*(word.encode() for word in words))
             status = self._lib.spProcessCommandLineArguments(request, array, len(words))
             code, size = None, ctypes.c_size_t()

@@ -14,15 +14,18 @@ from typing import Literal
 import numpy as np
 
 # Languages that Slang compiles to, and the endings of their files.
-Target = Literal["hlsl", "glsl", "wgsl", "metal", "cuda", "cpp"]
+Target = Literal["hlsl", "spirv", "glsl", "wgsl", "metal", "cuda", "cpp"]
 ENDINGS: dict[Target, str] = {
     "hlsl": ".hlsl",
+    "spirv": ".spv",
     "glsl": ".comp",
     "wgsl": ".wgsl",
     "metal": ".metal",
     "cuda": ".cu",
     "cpp": ".cpp",
 }
+# Those without cooperative vectors.
+PLAIN_TARGETS: tuple[Target, ...] = ("wgsl", "metal")
 
 
 @dataclass(frozen=True)
@@ -34,11 +37,13 @@ class Syntax:
     prologue : definitions of the common part
     array : constant array of a type, name, count and values
     image : declaration of an image: kind (IMAGE or TABLE), name, and place (first, width, height) in a buffer
+    cooperative : whether it has cooperative vectors
     """
 
     prologue: str
     array: str
     image: str
+    cooperative: bool = False
 
 
 GLSL = Syntax(
@@ -67,6 +72,7 @@ SLANG = Syntax(
 #define TEXEL(image, at) texel(image, at)""",
     array="static const {type} {name}[{count}] = {{ {values} }};",
     image="static const int3 {name} = int3({place});",
+    cooperative=True,
 )
 
 

@@ -2,64 +2,29 @@
 
 from __future__ import annotations
 
+import re
 import shutil
+import struct
 import subprocess
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from support.material_cases import CASES, make
+from support.slang_device import SlangDevice
 
 from mbtf_core.app.console import run
 from mbtf_core.directions import from_angles
-from mbtf_fit.backends.shader.slang import ENTRY, SlangCompiler, module_of
-from mbtf_fit.backends.shader.syntax import ENDINGS
+from mbtf_fit.backends.shader.slang import SlangCompiler, module_of
+from mbtf_fit.backends.shader.syntax import ENDINGS, PLAIN_TARGETS
 from mbtf_fit.cli.app import app
 from mbtf_fit.material.format import QUERY
+from mbtf_fit.material.material import to_half
+from mbtf_fit.ops import Network
+from mbtf_fit.training.sampler import LightMixture, sampler_inputs
 
-
-class Device:
-    """Slang's CPU device with a module."""
-
-    def __init__(self, module: str, folder: Path) -> None:
-        spy = pytest.importorskip("slangpy", reason="no slangpy; to enable: pip install 'mbtf[shaders]'")
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "material.slang").write_text(module)
-        self._spy = spy
-        options = {"include_paths": [str(folder)]}
-        self._device = spy.Device(type=spy.DeviceType.cpu, compiler_options=options)
-        self._kernels: dict[str, Any] = {}
-
-    def buffer(self, array: np.ndarray) -> Any:
-        usage = self._spy.BufferUsage
-        return self._device.create_buffer(
-            size=array.nbytes,
-            struct_size=4 * array.shape[-1] if array.ndim > 1 else 4,
-            usage=usage.shader_resource | usage.unordered_access,
-            data=np.ascontiguousarray(array, np.float32),
-        )
-
-    def values(self, texels: np.ndarray, queries: tuple[Any, ...]) -> np.ndarray:
-        """Values and transmittance (n, 4) of queries."""
-        u, sigma, omega_i, omega_o = queries
-        numbers = np.concatenate([u, sigma[:, None], omega_i, omega_o], 1)
-        inputs = {
-            "query_count": len(u),
-            "queries": self.buffer(numbers.reshape(-1)),
-            "material_texels": self.buffer(texels),
-        }
-        return self.run(ENTRY, len(u), 4, inputs, "values")
-
-    def run(self, entry: str, count: int, width: int, inputs: dict[str, Any], output: str) -> np.ndarray:
-        if entry not in self._kernels:
-            program = self._device.load_program("material.slang", [entry])
-            self._kernels[entry] = self._device.create_compute_kernel(program)
-        out = self.buffer(np.zeros((count, width), np.float32))
-        self._kernels[entry].dispatch(thread_count=[count, 1, 1], vars={**inputs, output: out})
-        return np.asarray(out.to_numpy().view(np.float32).reshape(count, width))
-
-
+pytest.importorskip("slangpy", reason="no slangpy; to enable: pip install 'mbtf[shaders]'")
 # Each takes seconds to compile: without those whose operations others have.
 SHADED = sorted(CASES.keys() - {"black", "calibrated", "relief", "relief without hints"})
 
@@ -67,9 +32,8 @@ SHADED = sorted(CASES.keys() - {"black", "calibrated", "relief", "relief without
 @pytest.mark.parametrize("case", SHADED)
 def test_values_are_those_of_the_material(case: str, tmp_path: Path) -> None:
     material = make(case, tmp_path / "material")
-    module, texels = module_of(material)
     q = material.conformance
-    found = Device(module, tmp_path / "module").values(texels, tuple(q[name] for name in QUERY))
+    found = SlangDevice(*module_of(material), tmp_path / "module").values(*(q[name] for name in QUERY))
     deviation = np.abs(found[:, :3] - q["rgb"]) / np.maximum(1.0, q["rgb"])
     assert q["rgb"].std() > 0.005
     # A traced ray may miss an edge.
@@ -79,6 +43,37 @@ def test_values_are_those_of_the_material(case: str, tmp_path: Path) -> None:
         through = material.transmittance.evaluate(*(q[k] for k in ("u", "sigma", "omega_o")))
         assert through.std() > 0.1
     np.testing.assert_allclose(found[:, 3], through, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("case", "half", "cooperative"),
+    [
+        ("relief", True, False),
+        ("relief", False, True),
+        ("holes", True, True),
+        ("direct offset, six outputs", True, True),
+        ("concatenated, softplus", False, True),
+    ],
+)
+def test_half_precision(case: str, half: bool, cooperative: bool, tmp_path: Path) -> None:
+    """A buffer of halves holds a rounded material exactly; cooperative vectors round all between layers."""
+    material = make(case, tmp_path / "material")
+    size = len(module_of(material)[1])
+    if half:
+        material, _ = to_half(material)
+    module, content = module_of(material, half=half)
+    assert (len(content) < 0.7 * size) == half
+    # HLSL's alignment of matrices.
+    places = [int(n) for pair in re.findall(r"layer<\d+>\(\w+, (\d+), (\d+)\)", module) for n in pair]
+    places += [int(n) for n in re.findall(r"#define MATRICES (\d+)", module)]
+    assert len(places) > 4
+    assert not any(place % 128 for place in places)
+    q = material.conformance
+    device = SlangDevice(module, content, tmp_path / "module", cooperative=cooperative)
+    found = device.evaluate(*(q[name] for name in QUERY))
+    apart = np.abs(found - q["rgb"]) / np.maximum(q["rgb"], q["rgb"].mean())
+    assert (apart.max(1) > (2e-2 if cooperative else 1e-4)).sum() <= 2
+    assert (np.median(apart) > 1e-5) == cooperative
 
 
 RAISING = """
@@ -95,15 +90,14 @@ def test_directions_below_the_plane_and_the_data(tmp_path: Path) -> None:
     """Lights and views below the plane give 0; directions below the smallest cosine are raised to it."""
     material = make("relief", tmp_path / "material")
     least = material.description["data"]["min_cos"] = 0.2
-    module, texels = module_of(material)
-    device = Device(module + RAISING, tmp_path / "module")
+    module, content = module_of(material)
+    device = SlangDevice(module + RAISING, content, tmp_path / "module")
     q, below = material.conformance, np.array([1, 1, -1], np.float32)
     for factors in ((below, 1), (1, below), (np.array([1, 1, 0], np.float32), 1)):
         omega_i, omega_o = q["omega_i"] * factors[0], q["omega_o"] * factors[1]
-        assert (device.values(texels, (q["u"], q["sigma"], omega_i, omega_o))[:, :3] == 0).all()
+        assert (device.evaluate(q["u"], q["sigma"], omega_i, omega_o) == 0).all()
     directions = from_angles(np.array([90.0, 30.0, 10.0, 0.1, -30.0]), np.full(5, 30.0)).astype(np.float32)
-    inputs = {"query_count": 5, "queries": device.buffer(directions.reshape(-1))}
-    found = device.run("raise_directions", 5, 4, inputs, "values")
+    found = device.run("raise_directions", 5, {"queries": directions})
     expected = directions.copy()
     expected[2:4] = from_angles(np.degrees(np.arcsin(least)), 30.0)
     np.testing.assert_allclose(found[:, :3], expected, atol=1e-6)
@@ -143,15 +137,14 @@ def _cells(omega: np.ndarray) -> np.ndarray:
 def test_lights_are_sampled_by_their_density(case: str, tmp_path: Path) -> None:
     """The density integrates to 1, and is that of the samples by their counts in cells."""
     material = make(case, tmp_path / "material", sampled=True)
-    module, texels = module_of(material)
-    device = Device(module + SAMPLING, tmp_path / "module")
+    module, content = module_of(material)
+    device = SlangDevice(module + SAMPLING, content, tmp_path / "module")
     view = from_angles(50.0, 30.0).astype(np.float32)
     random, count = np.random.default_rng(0), 1 << 16
-    shared = {"material_texels": device.buffer(texels), "view": view.tolist(), "query_count": count}
 
     def call(entry: str, numbers: np.ndarray) -> np.ndarray:
-        inputs = {**shared, "random_numbers": device.buffer(numbers.astype(np.float32).reshape(-1))}
-        return device.run(entry, count, 4, inputs, "samples").astype(np.float64)
+        inputs = {"view": view.tolist(), "random_numbers": numbers}
+        return device.run(entry, count, inputs, output="samples").astype(np.float64)
 
     z = 1 - 2 * (np.arange(count) + 0.5) / count
     angle = np.pi * (1 + np.sqrt(5)) * np.arange(count)
@@ -174,27 +167,84 @@ def test_lights_are_sampled_by_their_density(case: str, tmp_path: Path) -> None:
     assert abs(solid - 2 * np.pi * 0.95) < 5 * error
 
 
-def test_other_languages(tmp_path: Path) -> None:
-    pytest.importorskip("slangpy", reason="no slangpy; to enable: pip install 'mbtf[shaders]'")
+DENSITIES = """
+[shader("compute")] [numthreads(64, 1, 1)]
+void densities(uint3 thread : SV_DispatchThreadID) {
+  if (thread.x >= query_count) return;
+  uint k = 9 * thread.x;
+  float3 omega_i = float3(queries[k + 3], queries[k + 4], queries[k + 5]);
+  float3 omega_o = float3(queries[k + 6], queries[k + 7], queries[k + 8]);
+  Seen seen = stage1(float2(queries[k], queries[k + 1]), queries[k + 2], omega_o);
+  values[thread.x] = float4(pdf_light(seen, omega_i, omega_o));
+}
+"""
+
+
+@pytest.mark.parametrize("case", ["relief under a coat", "holes"])
+def test_densities_are_those_of_training(case: str, tmp_path: Path) -> None:
+    """The density of lights, of a random network at random places, is that by which it was trained."""
+    material = make(case, tmp_path / "material", sampled=True)
+    assert material.sampler is not None
+    q, network = material.conformance, material.sampler.operations[-1]
+    assert isinstance(network, Network)
+    x = sampler_inputs(material.model, material.sampler.operations, q["u"], q["sigma"], q["omega_o"])
+    weights, last = material.sampler.tensors, len(network.hidden)
+    for n in range(last + 1):
+        x = x @ weights[f"{network.weights}.{n}.weight"].T + weights[f"{network.weights}.{n}.bias"]
+        x = x.relu() if n < last else x
+    light, view = (torch.from_numpy(q[name])[:, None] for name in ("omega_i", "omega_o"))
+    expected = LightMixture.of(x).density(light, view)[:, 0].numpy()
+    module, content = module_of(material)
+    device = SlangDevice(module + DENSITIES, content, tmp_path / "module")
+    found = device.values(*(q[name] for name in QUERY), entry="densities")[:, 0]
+    assert expected.std() > 0.05
+    assert (np.abs(found - expected) > 1e-4 * np.maximum(expected, 1.0)).sum() <= 2
+
+
+# SPIR-V's OpCapability of VK_NV_cooperative_vector.
+COOPERATIVE_VECTOR = struct.pack("<II", 0x00020011, 5394)
+MARKS = {
+    ".hlsl": b"StructuredBuffer<float4",
+    ".spv": struct.pack("<I", 0x07230203),
+    ".comp": b"#version 450",
+    ".wgsl": b"@compute",
+    ".metal": b"[[kernel]]",
+    ".cu": b"__global__",
+}
+
+
+@pytest.mark.parametrize("more", [[], ["--half", "--shader-networks", "cooperative"]])
+def test_other_languages(
+    more: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("SLANG_RUN_SPIRV_VALIDATION", "1")
     make("relief", tmp_path / "material")
-    words = [word for target in ENDINGS for word in ("--shader-target", target)]
+    targets = [target for target in ENDINGS if not more or target not in PLAIN_TARGETS]
+    words = [word for target in targets for word in ("--shader-target", target)]
     out = tmp_path / "out"
-    command = ["export", str(tmp_path / "material"), "--to", "slang", *words, "-o", str(out), "-q"]
-    assert run(app, command) == 0
+    command = ["export", str(tmp_path / "material"), "--to", "slang", *more, "-o", str(out), "-q"]
+    assert run(app, [*command, *words]) == 0
     before = {path.name: path.read_bytes() for path in out.iterdir()}
-    assert len(before) == 3 + len(ENDINGS)
-    marks = {".hlsl": b"StructuredBuffer<float4", ".comp": b"#version 450", ".wgsl": b"@compute"}
-    marks |= {".metal": b"[[kernel]]", ".cu": b"__global__"}
+    assert len(before) == 3 + len(targets)
+    marks = MARKS | ({".hlsl": b"linalg_MulAdd", ".spv": COOPERATIVE_VECTOR} if more else {})
     for name, text in before.items():
         assert marks.get(Path(name).suffix, b"") in text, name
-    assert run(app, command) == 0
-    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
     if shutil.which("g++"):
         subprocess.run(["g++", "-fsyntax-only", "-w", str(out / "material.cpp")], check=True)
+    if shutil.which("nvcc"):
+        ptx = ["nvcc", "-ptx", "-w", "-o", str(tmp_path / "material.ptx"), str(out / "material.cu")]
+        subprocess.run(ptx, check=True)
+    if not more:
+        assert run(app, [*command, *words]) == 0
+        assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+    else:
+        assert run(app, [*command, "--shader-target", "metal", "--overwrite"]) == 2
+        assert "Slang has no cooperative vectors for metal" in capsys.readouterr().err
+        assert run(app, [*command, "--overwrite"]) == 2
+        assert "add --shader-target" in capsys.readouterr().err
 
 
 def test_the_documented_function_compiles(tmp_path: Path) -> None:
-    pytest.importorskip("slangpy", reason="no slangpy; to enable: pip install 'mbtf[shaders]'")
     make("relief", tmp_path / "material")
     out = tmp_path / "out"
     assert run(app, ["export", str(tmp_path / "material"), "--to", "slang", "-o", str(out), "-q"]) == 0
