@@ -16,9 +16,9 @@ from typing import Any
 from mbtf_core.errors import MbtfError
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun, ratio_of
-from mbtf_pipeline.collection.recipes import Published, seedless
+from mbtf_pipeline.collection.recipes import Published, first_known, seedless
 from mbtf_pipeline.stages import SHARDS
-from mbtf_pipeline.tables import Cell, Column, Table, estimate, rows_of
+from mbtf_pipeline.tables import Cell, Column, Table, estimate, is_significant, rows_of
 
 # Beside the runs: SUBMISSIONS/METHOD/RUN.npz with predictions of foreign code; runs are named for materials.
 SUBMISSIONS = "submissions"
@@ -45,12 +45,12 @@ class Entry:
 
     def error(self, *keys: str) -> Estimate | None:
         """``unexplained`` variance of the test queries, or of a group of them: mean over the seeds."""
-        found = [estimate(_inside(errors, *keys)["unexplained"]) for errors in self.errors]
-        if not found or not all(math.isfinite(e.value) for e in found):
-            return None
-        seeds = stdev(e.value for e in found) / math.sqrt(len(found)) if len(found) > 1 else 0.0
-        noise = fmean(e.error for e in found)
-        return Estimate(fmean(e.value for e in found), math.hypot(seeds, noise), found[0].n)
+        return _over_seeds([_inside(errors, *keys) for errors in self.errors])
+
+    def error_of_new_directions(self) -> Estimate | None:
+        """``unexplained`` variance of the queries with light or view in a region that no training saw."""
+        splits = [self.run.fit(fit)["splits"] for fit in self.fits]
+        return _over_seeds([s["held_out_directions"] for s in splits if "held_out_directions" in s])
 
     def mean(self, key: str) -> float | None:
         """Mean over the seeds of a number in the records of the fits."""
@@ -76,6 +76,16 @@ class Entry:
             if record["device"] == "cpu"
         ]
         return fmean(found) if found else None
+
+
+def _over_seeds(records: Sequence[Any]) -> Estimate | None:
+    """Mean of ``unexplained`` over the records of seeds; None where a number is unknown."""
+    found = [estimate(record["unexplained"]) for record in records]
+    if not found or not all(math.isfinite(e.value) for e in found):
+        return None
+    seeds = stdev(e.value for e in found) / math.sqrt(len(found)) if len(found) > 1 else 0.0
+    noise = fmean(e.error for e in found)
+    return Estimate(fmean(e.value for e in found), math.hypot(seeds, noise), found[0].n)
 
 
 def _inside(errors: Any, *keys: str) -> Any:
@@ -119,7 +129,9 @@ _COLUMNS = (
     Column("seeds", "seeds", lambda entry, _: len(entry.fits) or None),
     Column("unexplained variance", "unexplained", lambda entry, _: entry.problem or entry.error()),
     Column("relative to the first", "ratio", lambda entry, first: _ratio(entry, first)),
+    Column("significant", "significant", lambda entry, first: _significance(entry, first)),
     Column("grazing", "grazing", lambda entry, _: _lowest(entry)),
+    Column("new directions", "new_directions", lambda entry, _: entry.error_of_new_directions()),
     Column("LDR-FLIP", "flip_ldr", lambda entry, _: entry.flip()),
     Column("float32 [KiB]", "kib", lambda entry, _: entry.kib(), digits=",.0f"),
     Column("training [s]", "training_seconds", lambda entry, _: entry.mean("training_seconds"), digits=".0f"),
@@ -133,6 +145,29 @@ def _ratio(entry: Entry, first: Entry | None) -> Estimate | None:
     if upper is None or lower is None:
         return None
     return Estimate(1.0, 0.0, upper.n) if entry is first else ratio_of(upper, lower)
+
+
+def _significance(entry: Entry, first: Entry | None) -> str | None:
+    """Whether the error differs from that of the first method. Its standard error counts the noise of the
+    queries that both share twice, and is therefore rather too large."""
+    ratio = _ratio(entry, first)
+    if entry is first or ratio is None or not math.isfinite(ratio.value):
+        return None
+    return "yes" if is_significant(Estimate(ratio.value - 1.0, ratio.error, ratio.n)) else "no"
+
+
+def _published_columns(published: Sequence[Published]) -> list[Column]:
+    """Ratios of other sources to the same method, and these sources."""
+
+    def known(entry: Entry, first: Entry | None) -> tuple[float | None, str | None]:
+        if first is None or entry is first:
+            return None, None
+        return first_known(published, lambda p: p.mse_ratio(entry.run.material, entry.method, first.method))
+
+    return [
+        Column("published", "published", lambda *item: known(*item)[0]),
+        Column("source", "source", lambda *item: known(*item)[1]),
+    ]
 
 
 def ranking(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
@@ -156,11 +191,12 @@ def ranking(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list
         Column("largest", "largest"),
         Column("training [s]", "training_seconds", digits=".0f"),
     ]
+    by_material = [*_COLUMNS, *(_published_columns(published) if published else [])]
     # The best first; those without a number last.
     rows.sort(key=lambda row: row[2].value if isinstance(row[2], Estimate) else math.inf)
     return [
         Table("ranking", "Ranking", columns, rows),
-        Table("by_material", "Errors by material", _COLUMNS, rows_of(_COLUMNS, pairs)),
+        Table("by_material", "Errors by material", by_material, rows_of(by_material, pairs)),
     ]
 
 

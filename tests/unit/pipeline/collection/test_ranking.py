@@ -13,6 +13,7 @@ from support.fit_data import parallax, write_data
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.collection.finished_run import FinishedRun
 from mbtf_pipeline.collection.ranking import SUBMISSIONS, Entry, ranking
+from mbtf_pipeline.collection.recipes import Published
 from mbtf_pipeline.tables import Table
 
 NOISE = 0.01
@@ -28,7 +29,7 @@ def record(value: float) -> dict[str, Any]:
     low = {"unexplained": {"value": 2 * value, "error": NOISE, "n": 10}}
     test = {**unexplained, "n": 100, "elevations": {"0.5-1": unexplained, "0.1-0.5": low}}
     return {
-        "splits": {"test": test},
+        "splits": {"test": test, "held_out_directions": low},
         **{"training_seconds": 100 * value, "network_weights": 256, "texels": 512},
     }
 
@@ -63,6 +64,7 @@ def test_means_over_seeds_and_materials(runs: list[FinishedRun]) -> None:
     spread = math.hypot(0.02 / math.sqrt(3), NOISE)
     assert (rock["unexplained"].value, rock["unexplained"].error) == pytest.approx((0.2, spread))
     assert rock["grazing"].value == pytest.approx(0.4)
+    assert rock["new_directions"].value == pytest.approx(0.4)
     assert (rock["flip_ldr"], rock["kib"], rock["training_seconds"]) == pytest.approx((0.3, 3, 20))
     assert by_material["rock", "relief"]["ratio"].value == pytest.approx(0.5)
     relief = ranked["relief",]
@@ -78,6 +80,21 @@ def test_means_over_seeds_and_materials(runs: list[FinishedRun]) -> None:
     # Of one material alone, and worse than the first there.
     assert list(ranked) == [("relief",), ("neumip",), ("svbrdf",)]
     assert ranked["svbrdf",]["materials"] == 1
+
+
+def test_significance_and_published_ratios_stand_beside_the_errors(runs: list[FinishedRun]) -> None:
+    known = Published(source="a paper", mse={"rock": {"neumip": 4.0, "relief": 1.0}})
+    for fit, record in runs[1].comparison["test"].items():
+        if fit.startswith("relief"):
+            record["splits"]["test"]["unexplained"] = {"value": 0.39, "error": NOISE, "n": 100}
+    by_material = cells(ranking(runs, [known])[1])
+    assert [by_material["rock", name]["significant"] for name in ("neumip", "relief")] == [None, "yes"]
+    assert [by_material["wool", name]["significant"] for name in ("relief", "svbrdf")] == ["no", "yes"]
+    assert (by_material["rock", "relief"]["published"], by_material["rock", "relief"]["source"]) == (
+        0.25,
+        "a paper",
+    )
+    assert by_material["rock", "neumip"]["published"] is by_material["wool", "relief"]["published"] is None
 
 
 def test_an_error_of_unknown_size_is_not_ranked(runs: list[FinishedRun]) -> None:
