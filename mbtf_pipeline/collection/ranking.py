@@ -7,13 +7,14 @@ the seeds, and the noise of the test queries, which all seeds share.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
 from mbtf_core.errors import MbtfError
+from mbtf_core.files.atomic import data_sha256, read_json
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun, ratio_of
 from mbtf_pipeline.collection.recipes import Published, first_known, seedless
@@ -170,8 +171,29 @@ def _published_columns(published: Sequence[Published]) -> list[Column]:
     ]
 
 
+def _digest(run: FinishedRun) -> str:
+    """First digits of the SHA-256 over those of all shards."""
+    sidecars = sorted((run.folder / SHARDS).glob("*-?????.json"))
+    return data_sha256([read_json(file)["sha256"] for file in sidecars])[:16]
+
+
+def _of_split(split: str, key: str) -> Callable[[FinishedRun], int]:
+    return lambda run: run.manifest["splits"][split][key]
+
+
+_DATA_COLUMNS = (
+    MATERIAL,
+    Column("layout", "layout", lambda run: run.manifest["layout"]),
+    Column("training queries", "train", _of_split("train", "queries")),
+    Column("test queries", "test", _of_split("test", "queries")),
+    Column("paths per test query", "test_spp", _of_split("test", "spp")),
+    Column("SHA-256 of the configuration", "config", lambda run: run.manifest["config_hash"][:16]),
+    Column("of the shards", "shards", _digest),
+)
+
+
 def ranking(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
-    """Methods by the geometric mean of their errors, and every method on every material."""
+    """Methods by the geometric mean of their errors, every method on every material, and the data sets."""
     found = list(entries(runs))
     firsts = {entry.run.folder: entry for entry in found if entry.method == found[0].method}
     pairs = [(entry, firsts.get(entry.run.folder)) for entry in found]
@@ -197,6 +219,7 @@ def ranking(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list
     return [
         Table("ranking", "Ranking", columns, rows),
         Table("by_material", "Errors by material", by_material, rows_of(by_material, pairs)),
+        Table("data_sets", "Data sets", _DATA_COLUMNS, rows_of(_DATA_COLUMNS, [(run,) for run in runs])),
     ]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,9 @@ def make(folder: Path, material: str) -> FinishedRun:
     }
     pictures = [{"fits": {fit: {"flip": {"ldr": 0.3}} for fit in fits}}]
     comparison = {"fits": list(fits), "test": fits, "pictures": pictures}
-    return FinishedRun(material, "", folder / "runs" / material, comparison, {})
+    splits = {"train": {"queries": 4, "spp": 2}, "test": {"queries": 3, "spp": 8}}
+    manifest = {"layout": "shuffled", "config_hash": 64 * "0", "splits": splits}
+    return FinishedRun(material, "", folder / "runs" / material, comparison, manifest)
 
 
 @pytest.fixture
@@ -57,7 +60,7 @@ def cells(table: Table) -> dict[tuple[Any, ...], dict[str, Any]]:
 
 
 def test_means_over_seeds_and_materials(runs: list[FinishedRun]) -> None:
-    ranked, by_material = map(cells, ranking(runs, []))
+    ranked, by_material, _ = map(cells, ranking(runs, []))
     rock = by_material["rock", "neumip"]
     assert rock["seeds"] == 3
     # Standard error of the seeds' mean, and the noise of the test queries that they share.
@@ -100,11 +103,26 @@ def test_significance_and_published_ratios_stand_beside_the_errors(runs: list[Fi
 def test_an_error_of_unknown_size_is_not_ranked(runs: list[FinishedRun]) -> None:
     assert ranking([], [])[0].rows == []
     runs[0].comparison["test"]["relief-seed1"]["splits"]["test"]["unexplained"]["value"] = None
-    ranked, by_material = map(cells, ranking(runs, []))
+    ranked, by_material, _ = map(cells, ranking(runs, []))
     assert by_material["rock", "relief"]["unexplained"] is None
     assert ranked["relief",]["ratio"] is None
     assert list(ranked)[-1] == ("relief",)
     assert Entry(runs[0], "none", []).error() is None
+
+
+def test_data_sets_that_are_made_again_have_equal_digests(runs: list[FinishedRun]) -> None:
+    for run, noise in zip(runs, (0.0, 0.1), strict=True):
+        write_data(run.folder / "shards", parallax, train=100, test=10, noise=noise)
+
+    def digests() -> list[Any]:
+        return [row["shards"] for row in cells(ranking(runs, [])[2]).values()]
+
+    first = digests()
+    assert first[0] != first[1]
+    write_data(runs[1].folder / "again", parallax, train=100, test=10, noise=0.0)
+    shutil.rmtree(runs[1].folder / "shards")
+    (runs[1].folder / "again").rename(runs[1].folder / "shards")
+    assert digests() == [first[0]] * 2
 
 
 def test_foreign_predictions_are_ranked_and_faulty_ones_named(
@@ -119,7 +137,7 @@ def test_foreign_predictions_are_ranked_and_faulty_ones_named(
         folder.mkdir(parents=True)
         np.savez(folder / "rock.npz", value=value + offset * spread)
     np.savez(tmp_path / SUBMISSIONS / "poor" / "wool.npz", value=value)
-    ranked, by_material = map(cells, ranking(runs, []))
+    ranked, by_material, _ = map(cells, ranking(runs, []))
     assert by_material["rock", "good"]["unexplained"].value == pytest.approx(0.01, rel=0.3)
     assert by_material["rock", "poor"]["unexplained"].value == pytest.approx(0.81, rel=0.3)
     # Its run has no data set here: the row says so.
