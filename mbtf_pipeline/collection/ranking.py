@@ -157,16 +157,20 @@ def _significance(entry: Entry, first: Entry | None) -> str | None:
     return "yes" if is_significant(Estimate(ratio.value - 1.0, ratio.error, ratio.n)) else "no"
 
 
-def _published_columns(published: Sequence[Published]) -> list[Column]:
-    """Ratios of other sources to the same method, and these sources."""
+def _with_published(published: Sequence[Published]) -> list[Column]:
+    """All columns; with published ratios to the same method beside ours, and their sources last."""
+    if not published:
+        return [*_COLUMNS]
 
     def known(entry: Entry, first: Entry | None) -> tuple[float | None, str | None]:
         if first is None or entry is first:
             return None, None
         return first_known(published, lambda p: p.mse_ratio(entry.run.material, entry.method, first.method))
 
+    beside = 1 + [column.key for column in _COLUMNS].index("ratio")
+    ratio = Column("published", "published", lambda *item: known(*item)[0])
     return [
-        Column("published", "published", lambda *item: known(*item)[0]),
+        *(*_COLUMNS[:beside], ratio, *_COLUMNS[beside:]),
         Column("source", "source", lambda *item: known(*item)[1]),
     ]
 
@@ -213,7 +217,7 @@ def ranking(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list
         Column("largest", "largest"),
         Column("training [s]", "training_seconds", digits=".0f"),
     ]
-    by_material = [*_COLUMNS, *(_published_columns(published) if published else [])]
+    by_material = _with_published(published)
     # The best first; those without a number last.
     rows.sort(key=lambda row: row[2].value if isinstance(row[2], Estimate) else math.inf)
     return [
