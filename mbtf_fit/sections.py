@@ -80,9 +80,6 @@ class NetworkSection(Settings):
     oversampling: Literal[1, 2] = Field(
         1, description="texels of the feature textures per texel of the data, along each axis"
     )
-    blending: Literal["blend", "concatenate"] = Field(
-        "blend", description="features of two adjacent levels: weighted sum, or concatenation"
-    )
     encoding: EncodingSection = EncodingSection()
     relief: ReliefSection = ReliefSection()
 
@@ -228,6 +225,9 @@ class TrainingSection(Settings):
     )
     energy_calibration: bool = Field(
         True, description="after training, scale the mean reflectance at each elevation to that of the data"
+    )
+    importance_sampling: bool = Field(
+        True, description="after training, fit the network by which renderers sample lights"
     )
     blur: BlurSection = BlurSection()
 

@@ -43,6 +43,7 @@ from mbtf_pipeline.stages import (
 )
 
 if TYPE_CHECKING:
+    from mbtf_core.data.schema import Layout
     from mbtf_fit.viewer.live import LiveView
 
 GENERATE_STAGE, COMPARE_STAGE, REPORT_STAGE = "generate", "compare", "report"
@@ -61,11 +62,12 @@ class DataSet(NamedTuple):
     config: GeneratorConfig
 
 
-def layout_of(config: FitConfig) -> str:
-    """Data layout that a fit's model requires."""
+def layout_of(config: FitConfig, own: Layout) -> Layout:
+    """Layout of the data that a fit is trained on: the recipe's `own`, if its model reads it."""
     from mbtf_fit.models.registry import model_class
 
-    return model_class(config.model).layout
+    model = model_class(config.model)
+    return own if model.reads(own) else model.layout
 
 
 def data_sets(recipe: Recipe) -> list[DataSet]:
@@ -75,7 +77,7 @@ def data_sets(recipe: Recipe) -> list[DataSet]:
     """
     out = [DataSet(GENERATE_STAGE, SHARDS, recipe.generate)]
     own = recipe.generate.queries.layout
-    for layout in sorted({layout_of(config) for config in recipe.fit.values()} - {own}):
+    for layout in sorted({layout_of(config, own) for config in recipe.fit.values()} - {own}):
         queries = recipe.generate.queries.model_copy(update={"layout": layout, "test": "1"})
         config = recipe.generate.model_copy(update={"queries": queries})
         out.append(DataSet(f"{GENERATE_STAGE} {layout}", f"{SHARDS}-{layout}", config))
@@ -128,7 +130,7 @@ class _RecipeRun:
             config = data.config.model_dump(mode="json", exclude={"material"})
             out.append(Stage(data.stage, (), config, inputs, (data.sub,), partial(self._generate, data)))
         for name, fit in recipe.fit.items():
-            data, fields = data_of[layout_of(fit)], fit.fields()
+            data, fields = data_of[layout_of(fit, recipe.generate.queries.layout)], fit.fields()
             # Data sets of other materials count by what they hold, not by where they lie.
             others = [_manifest_digest(Path(folder)) for folder in fit.training.materials]
             fields["training"] = {**fields["training"], "materials": others}

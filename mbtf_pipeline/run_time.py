@@ -215,7 +215,7 @@ class TimedRun:
         names = PRESETS if quality is None else (quality,)
         recipes = {name: preset_recipe(file, name, assignments) for name in names}
         first = recipes[names[0]]
-        if any(layout_of(fit) != "shuffled" for fit in first.fit.values()):
+        if any(layout_of(fit, "shuffled") != "shuffled" for fit in first.fit.values()):
             problem = "only models of the shuffled layout can share a time"
             raise UsageError(problem, where="--time", hint="leave out the fits of models with another layout")
         options = [

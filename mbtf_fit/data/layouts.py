@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mbtf_core.data.lattice import Lattice, level_of_sigma
+from mbtf_core.data.lattice import Lattice, level_of_sigma, texel_centers
 from mbtf_fit.data.queries import TrainingQueries
 
 
@@ -165,6 +165,8 @@ class TrainingImages:
         return np.array([order[int(s)][p] for s, p in zip(epochs, position, strict=True)]), side
 
 
+# Random stream of the order of slices as queries; the streams of batches count up from 0.
+ORDER_STREAM = 1 << 61
 # Pairs of light and view per texel: that a batch decodes, and that encoders of sets read.
 DECODED, READ = 64, 128
 
@@ -234,6 +236,16 @@ class TrainingSlices:
     def scaled(self, factor: float) -> TrainingSlices:
         """The same slices with all values multiplied."""
         return replace(self, values=self.values * factor)
+
+    def as_queries(self, lattice: Lattice, seed: int) -> TrainingQueries:
+        """All values as queries at the centers of the texels, in random order."""
+        pairs = self.values.shape[1]
+        order = torch.from_numpy(philox(seed, ORDER_STREAM).permutation(len(self)))
+        texel, pair = order // pairs, order % pairs
+        u = torch.from_numpy(texel_centers(*lattice.shape()).astype(np.float32)).view(-1, 2)
+        sigma = torch.full((len(self),), self.sigma)
+        value = self.values.flatten(0, 1)[order]
+        return TrainingQueries(u[texel], sigma, self.omega_i[pair], self.omega_o[pair], value)
 
     def _texels(self, size: int, seed: int, step: int) -> NDArray[np.int64]:
         """Texels of the batch of a step, at random."""

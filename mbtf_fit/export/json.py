@@ -11,7 +11,7 @@ from mbtf_core.files.atomic import write_text
 from mbtf_fit.export import Export, ExportTarget
 
 LAYERS_NAME = "layers.json"
-_SCHEMA = 5
+_SCHEMA = 6
 
 
 def _numbers(array: Any) -> Any:

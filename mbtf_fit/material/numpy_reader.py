@@ -170,11 +170,11 @@ class NumpyMaterial:
             return self.tensors.get(x, x) if isinstance(x, str) else x
         return self.values[name][..., slice(*map(int, part[:-1].split(":"))) if part else slice(None)]
 
-    def lookup(self, u, level, textures, blending="blend", **_):
+    def lookup(self, u, level, textures, finer=0, **_):
         levels = [x for name, x in self.tensors.items() if name.startswith(f"{textures}.")]
-        weights = np.maximum(0, 1 - abs(np.clip(level or 0, 0, len(levels) - 1) - range(len(levels))))
-        parts = [w * bilinear(x, u) if w else 0 * x[0, 0] for w, x in zip(weights, levels, strict=True)]
-        return sum(parts) if blending == "blend" else join(sum(parts[::2]), sum(parts[1::2], 0 * parts[0]))
+        at = np.clip((level or 0) + finer, 0, len(levels) - 1)
+        weights = np.maximum(0, 1 - abs(at - range(len(levels))))
+        return sum(w * bilinear(x, u) for w, x in zip(weights, levels, strict=True) if w)
 
     def neighborhood(self, u, level, margin):
         columns, steps = 2 ** np.floor(level + 0.5), np.arange(-margin, margin + 1)

@@ -22,20 +22,14 @@ if TYPE_CHECKING:
 SPECIAL = (
     *("network.channels", "network.width", "network.layers", "network.decoder", "network.activation"),
     *("network.output_channels", "network.output_transform", "network.offset", "network.oversampling"),
-    *("network.blending", "network.encoding"),
+    "network.encoding",
     *(f"network.relief.{name}" for name in ("places", "hints", "frame", "gate")),
     *("init_from", "decoder", "training.shared_decoder", "training.materials", "training.own_material"),
 )
 # Those of a network that decodes a pyramid of textures.
 PYRAMID = (
     *("network.channels", "network.width", "network.layers", "network.activation", "network.output_channels"),
-    *(
-        "network.output_transform",
-        "network.oversampling",
-        "network.blending",
-        "network.encoding",
-        "init_from",
-    ),
+    *("network.output_transform", "network.oversampling", "network.encoding", "init_from"),
 )
 SHARED = ("decoder", "training.shared_decoder")
 
@@ -95,6 +89,11 @@ class Model:
 
     def __init__(self, material: NeuralMaterial) -> None:
         self.material = material
+
+    @classmethod
+    def reads(cls, layout: Layout) -> bool:
+        """Whether it is trained on data of a layout: slices are queries as well."""
+        return layout == cls.layout or (layout, cls.layout) == ("slices", "shuffled")
 
     @classmethod
     def operations(cls, lattice: Lattice, network: NetworkSection) -> list[Operation]:

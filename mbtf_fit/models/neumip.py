@@ -110,7 +110,7 @@ def neural_offset(u: str, network: NetworkSection) -> tuple[str, list[Operation]
 
 def pyramid(u: str, network: NetworkSection) -> Operation:
     """The features at a position and level."""
-    return Lookup("features", u, "level", "pyramid", network.channels, network.blending, network.oversampling)
+    return Lookup("features", u, "level", "pyramid", network.channels, network.oversampling)
 
 
 def encode_position(u: str, encoding: EncodingSection) -> tuple[list[Operation], Sequence[str]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated
 
 from mbtf_fit.ops.constants import GRAZING, MAX_CROSSINGS, OFFSET_SCALE
 from mbtf_fit.ops.operation import Operation, TensorName, TextureName, Value
@@ -14,28 +14,28 @@ from mbtf_fit.ops.operation import Operation, TensorName, TextureName, Value
 class Lookup(Operation):
     """Bilinear lookup in periodic textures (NeuMIP, sections 4.1 and 4.2).
 
-    At the fractional level l, ``(1 - frac(l)) T_⌊l⌋(u) + frac(l) T_⌊l⌋+1(u)``; or both terms side by side,
-    that of the even level first (Quartesan et al. 2022). Without a level the texture is that of the finest
-    level alone. Row 0 is the side ``v → 1``, texel centers are at ``((i+½)/W, 1-(j+½)/H)``.
+    At the fractional level l, ``(1 - frac(l)) T_⌊l⌋(u) + frac(l) T_⌊l⌋+1(u)``. Without a level the texture is
+    that of the finest level alone. Row 0 is the side ``v → 1``, texel centers are at ``((i+½)/W,
+    1-(j+½)/H)``.
 
     Attributes
     ----------
     u, level : position (2), fractional level (1) or None
     textures : tensors (rows, columns, channels) of the levels, coarsest first; of one without a level
     channels : features per texel
-    blending : ``blend``, or ``concatenate`` for both terms
     oversampling : texels per texel of the level, along each axis
+    finer : added to the level, which is then clamped: -1 reads the next coarser one
     """
 
     u: Value
     level: Value | None
     textures: TextureName
     channels: int
-    blending: Literal["blend", "concatenate"] = "blend"
     oversampling: int = 1
+    finer: float = 0.0
 
     def size(self, sizes: Sequence[int]) -> int:
-        return self.channels * (2 if self.blending == "concatenate" else 1)
+        return self.channels
 
 
 @dataclass(frozen=True)

@@ -73,15 +73,7 @@ def _per_width(run: Execution, like: Tensor) -> Tensor:
 
 @PYTORCH.implements(ops.Lookup)
 def _lookup(op: ops.Lookup, run: Execution, u: Tensor, level: Tensor | None) -> Tensor:
-    textures = run.material.texture(op.textures)
-    if op.blending == "blend" or level is None:
-        return textures(u, level)
-    coarse, weight = coarse_level(level, run.material.lattice.finest + 1)
-    low = (1 - weight)[:, None] * textures(u, coarse)
-    high = weight[:, None] * textures(u, coarse + 1)
-    # Even and odd levels keep their order, so that the result is continuous at whole levels.
-    odd = (coarse.remainder(2) == 1)[:, None]
-    return torch.cat([torch.where(odd, high, low), torch.where(odd, low, high)], 1)
+    return run.material.texture(op.textures)(u, None if level is None else level + op.finer)
 
 
 @PYTORCH.implements(ops.Neighborhood)

@@ -111,8 +111,10 @@ def export_fit(
         training["transmittance"] = evaluate_transmittance(transmittance, data, partition.selection)
     described = member.identity["data"]
     least = described.get("min_cos", DEFAULT_MIN_COS)
-    announce("distilling", 0.0, name)
-    sampler = distill(trainer.model, share["steps"] * trainer.batch, least, config.seed)
+    sampler = None
+    if config.training.importance_sampling:
+        announce("distilling", 0.0, name)
+        sampler = distill(trainer.model, share["steps"] * trainer.batch, least, config.seed)
     announce("writing", 0.0, name)
     export(
         trainer.model,

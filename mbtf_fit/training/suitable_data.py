@@ -23,7 +23,7 @@ def open_data(folder: str | Path | DataFolder, model: str, cache: float | None =
     InputError : it cannot be read, has another layout than the model needs, or lacks the geometry
     """
     data, needs = Dataset.open(folder, cache), model_class(model)
-    if data.layout != needs.layout:
+    if not needs.reads(data.layout):
         raise InputError(
             f"the data set has the {data.layout} layout, but {model} needs the {needs.layout} layout",
             where=data.folder,

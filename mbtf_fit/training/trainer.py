@@ -351,7 +351,10 @@ def prepare_trainer(
         typical = typical_value(mean_value(part.sample.value_a, part.sample.value_b))
         return part.training.to(device), typical
 
-    hooks, training = model_class(config.model)(model), partition.training.to(device)
+    hooks, training = model_class(config.model)(model), partition.training
+    if isinstance(training, TrainingSlices) and hooks.layout == "shuffled":
+        training = training.as_queries(data.lattice, config.seed)
+    training = training.to(device)
     training = hooks.prepare(Preparation(data, training, config.training, unit, config.seed, load))
     if config.init_from is not None:
         _initialize_from(hooks, config.init_from)

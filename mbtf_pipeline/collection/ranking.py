@@ -7,18 +7,19 @@ the seeds, and the noise of the test queries, which all seeds share.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
 
 from mbtf_core.errors import MbtfError
+from mbtf_core.files.atomic import data_sha256, read_json
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun, ratio_of
-from mbtf_pipeline.collection.recipes import Published, seedless
+from mbtf_pipeline.collection.recipes import Published, first_known, seedless
 from mbtf_pipeline.stages import SHARDS
-from mbtf_pipeline.tables import Cell, Column, Table, estimate, rows_of
+from mbtf_pipeline.tables import Cell, Column, Table, estimate, is_significant, rows_of
 
 # Beside the runs: SUBMISSIONS/METHOD/RUN.npz with predictions of foreign code; runs are named for materials.
 SUBMISSIONS = "submissions"
@@ -45,12 +46,12 @@ class Entry:
 
     def error(self, *keys: str) -> Estimate | None:
         """``unexplained`` variance of the test queries, or of a group of them: mean over the seeds."""
-        found = [estimate(_inside(errors, *keys)["unexplained"]) for errors in self.errors]
-        if not found or not all(math.isfinite(e.value) for e in found):
-            return None
-        seeds = stdev(e.value for e in found) / math.sqrt(len(found)) if len(found) > 1 else 0.0
-        noise = fmean(e.error for e in found)
-        return Estimate(fmean(e.value for e in found), math.hypot(seeds, noise), found[0].n)
+        return _over_seeds([_inside(errors, *keys) for errors in self.errors])
+
+    def error_of_new_directions(self) -> Estimate | None:
+        """``unexplained`` variance of the queries with light or view in a region that no training saw."""
+        splits = [self.run.fit(fit)["splits"] for fit in self.fits]
+        return _over_seeds([s["held_out_directions"] for s in splits if "held_out_directions" in s])
 
     def mean(self, key: str) -> float | None:
         """Mean over the seeds of a number in the records of the fits."""
@@ -76,6 +77,16 @@ class Entry:
             if record["device"] == "cpu"
         ]
         return fmean(found) if found else None
+
+
+def _over_seeds(records: Sequence[Any]) -> Estimate | None:
+    """Mean of ``unexplained`` over the records of seeds; None where a number is unknown."""
+    found = [estimate(record["unexplained"]) for record in records]
+    if not found or not all(math.isfinite(e.value) for e in found):
+        return None
+    seeds = stdev(e.value for e in found) / math.sqrt(len(found)) if len(found) > 1 else 0.0
+    noise = fmean(e.error for e in found)
+    return Estimate(fmean(e.value for e in found), math.hypot(seeds, noise), found[0].n)
 
 
 def _inside(errors: Any, *keys: str) -> Any:
@@ -119,7 +130,9 @@ _COLUMNS = (
     Column("seeds", "seeds", lambda entry, _: len(entry.fits) or None),
     Column("unexplained variance", "unexplained", lambda entry, _: entry.problem or entry.error()),
     Column("relative to the first", "ratio", lambda entry, first: _ratio(entry, first)),
+    Column("significant", "significant", lambda entry, first: _significance(entry, first)),
     Column("grazing", "grazing", lambda entry, _: _lowest(entry)),
+    Column("new directions", "new_directions", lambda entry, _: entry.error_of_new_directions()),
     Column("LDR-FLIP", "flip_ldr", lambda entry, _: entry.flip()),
     Column("float32 [KiB]", "kib", lambda entry, _: entry.kib(), digits=",.0f"),
     Column("training [s]", "training_seconds", lambda entry, _: entry.mean("training_seconds"), digits=".0f"),
@@ -135,8 +148,56 @@ def _ratio(entry: Entry, first: Entry | None) -> Estimate | None:
     return Estimate(1.0, 0.0, upper.n) if entry is first else ratio_of(upper, lower)
 
 
+def _significance(entry: Entry, first: Entry | None) -> str | None:
+    """Whether the error differs from that of the first method. Its standard error counts the noise of the
+    queries that both share twice, and is therefore rather too large."""
+    ratio = _ratio(entry, first)
+    if entry is first or ratio is None or not math.isfinite(ratio.value):
+        return None
+    return "yes" if is_significant(Estimate(ratio.value - 1.0, ratio.error, ratio.n)) else "no"
+
+
+def _with_published(published: Sequence[Published]) -> list[Column]:
+    """All columns; with published ratios to the same method beside ours, and their sources last."""
+    if not published:
+        return [*_COLUMNS]
+
+    def known(entry: Entry, first: Entry | None) -> tuple[float | None, str | None]:
+        if first is None or entry is first:
+            return None, None
+        return first_known(published, lambda p: p.mse_ratio(entry.run.material, entry.method, first.method))
+
+    beside = 1 + [column.key for column in _COLUMNS].index("ratio")
+    ratio = Column("published", "published", lambda *item: known(*item)[0])
+    return [
+        *(*_COLUMNS[:beside], ratio, *_COLUMNS[beside:]),
+        Column("source", "source", lambda *item: known(*item)[1]),
+    ]
+
+
+def _digest(run: FinishedRun) -> str:
+    """First digits of the SHA-256 over those of all shards."""
+    sidecars = sorted((run.folder / SHARDS).glob("*-?????.json"))
+    return data_sha256([read_json(file)["sha256"] for file in sidecars])[:16]
+
+
+def _of_split(split: str, key: str) -> Callable[[FinishedRun], int]:
+    return lambda run: run.manifest["splits"][split][key]
+
+
+_DATA_COLUMNS = (
+    MATERIAL,
+    Column("layout", "layout", lambda run: run.manifest["layout"]),
+    Column("training queries", "train", _of_split("train", "queries")),
+    Column("test queries", "test", _of_split("test", "queries")),
+    Column("paths per test query", "test_spp", _of_split("test", "spp")),
+    Column("SHA-256 of the configuration", "config", lambda run: run.manifest["config_hash"][:16]),
+    Column("of the shards", "shards", _digest),
+)
+
+
 def ranking(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
-    """Methods by the geometric mean of their errors, and every method on every material."""
+    """Methods by the geometric mean of their errors, every method on every material, and the data sets."""
     found = list(entries(runs))
     firsts = {entry.run.folder: entry for entry in found if entry.method == found[0].method}
     pairs = [(entry, firsts.get(entry.run.folder)) for entry in found]
@@ -156,11 +217,13 @@ def ranking(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list
         Column("largest", "largest"),
         Column("training [s]", "training_seconds", digits=".0f"),
     ]
+    by_material = _with_published(published)
     # The best first; those without a number last.
     rows.sort(key=lambda row: row[2].value if isinstance(row[2], Estimate) else math.inf)
     return [
         Table("ranking", "Ranking", columns, rows),
-        Table("by_material", "Errors by material", _COLUMNS, rows_of(_COLUMNS, pairs)),
+        Table("by_material", "Errors by material", by_material, rows_of(by_material, pairs)),
+        Table("data_sets", "Data sets", _DATA_COLUMNS, rows_of(_DATA_COLUMNS, [(run,) for run in runs])),
     ]
 
 

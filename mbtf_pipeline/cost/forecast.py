@@ -38,7 +38,7 @@ def forecast_errors(recipe: Recipe, folder: Path, note: Callable[[str], None]) -
     found: dict[str, dict[str, Any]] = {}
     missing: dict[str, str] = {}
     for name, fit in recipe.fit.items():
-        data = data_of[layout_of(fit)]
+        data = data_of[layout_of(fit, recipe.generate.queries.layout)]
         if not stale[data.stage] and is_dataset(folder / data.sub):
             note(f"{name}: pilots on the data")
             forecast = forecast_fit(fit, folder / data.sub).error

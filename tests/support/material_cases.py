@@ -27,7 +27,7 @@ CASES: dict[str, dict[str, Any]] = {
         output_transform="fourth-root",
         encoding={"direction_xyz": True, "half_vector": True},
     ),
-    "concatenated, softplus": net(blending="concatenate", activation="sine", output_transform="softplus"),
+    "four levels, softplus": {"model": "quartesan2022", **net(output_transform="softplus")},
     "baseline, encoded": {
         "model": "neumip-baseline",
         **net(encoding={**BANDS, "band_attenuation": True, "footprint_filtered": True}),

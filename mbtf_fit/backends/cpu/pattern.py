@@ -103,7 +103,7 @@ class _Matcher:
         self._expect(part in ("", "0:3]"), "" not in (unit, most))
         decoder = self._take(name, ops.Network, outputs=3 + (gate is not None), activation="relu")
         features, light, view, *rest = (*decoder.x, "", "", "")[: max(3, len(decoder.x))]
-        lookup = self._take(features, ops.Lookup, level="level", blending="blend")
+        lookup = self._take(features, ops.Lookup, level="level", finer=0.0)
         self._expect((light, view) in _LIGHTS)
         half = bool(rest) and self._is(rest[0], ops.HalfVector)
         if half:

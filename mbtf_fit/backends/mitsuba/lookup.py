@@ -25,8 +25,7 @@ def _lookup(op: ops.Lookup, loader: Loader) -> Step:
     textures = loader.texture(op.textures, shapes[-1:] if op.level is None else shapes, op.channels)
     if op.level is None:
         return lambda u, _: textures.first(mi.Point2f(*u))
-    read = textures.blended if op.blending == "blend" else textures.side_by_side
-    return lambda u, level: read(mi.Point2f(*u), *level)
+    return lambda u, level: textures.blended(mi.Point2f(*u), level[0] + op.finer)
 
 
 @MITSUBA.implements(ops.SurfaceMaps)

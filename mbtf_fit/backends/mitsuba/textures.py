@@ -74,18 +74,6 @@ class Textures:
             lambda u, coarse, weight, low, group: low,
         )
 
-    def side_by_side(self, u: Point2f, level: Float) -> list[Float]:
-        """The same two terms, concatenated: that of the even level, then that of the odd one."""
-        none = [0.0] * self.channels
-        if len(self.shapes) == 1:
-            return [*self.first(u), *(mi.Float(v) for v in none)]
-        coarse, weight = self._coarse(level)
-        finer = dr.minimum(coarse + 1, len(self.shapes) - 1)
-        low, high = self._level(u, coarse, 1.0 - weight, none), self._level(u, finer, weight, none)
-        odd = (coarse & 1) == 1
-        both = list(zip(low, high, strict=True))
-        return [dr.select(odd, h, v) for v, h in both] + [dr.select(odd, v, h) for v, h in both]
-
     def _coarse(self, level: Float) -> tuple[UInt32, Float]:
         """(coarser level, weight of the finer one), which is 0 at whole levels."""
         level = dr.clip(level, 0.0, len(self.shapes) - 1.0)

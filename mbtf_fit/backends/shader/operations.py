@@ -28,27 +28,14 @@ FUNCTIONS = {
 @SHADER.implements(ops.Lookup)
 def _lookup(op: ops.Lookup, code: Code, u: Value, level: Value | None) -> str | Value:
     image = code.image(op.textures, half=op.textures not in code.precise)
-    layers = image.layers
     if level is None:
-        read = f"bilinear({image}, {code.let('Corners', f'corners({image.level(0)}, {u})')}, {{k}})"
+        read = f"bilinear({image}, {code.let('Corners', f'corners({image.level(0)}, {u})')}, k)"
     else:
-        pair = code.let("Pair", code.pair(image, str(level), str(u)), "pair")
-        read = f"blended({image}, {pair}, {{k}})"
-    if level is None or op.blending == "blend":
-        out = code.variable("float4", op.output, layers)
-        code.write(f"for (int k = 0; k < {layers}; k++) {out}[k] = {read.format(k='k')};")
-        return Value.of_array(out, op.channels, code.lit)
-    # Even and odd levels keep their order.
-    out = code.variable("float4", op.output, 2 * layers)
-    odd = code.let("int", f"min(int({level}), {max(len(image.levels) - 2, 0)}) & 1", "odd")
-    code.write(
-        f"for (int k = 0; k < {layers}; k++) {{",
-        f"  {out}[{odd} * {layers} + k] = (1.0 - {pair}.weight) * bilinear({image}, {pair}.coarse, k);",
-        f"  {out}[(1 - {odd}) * {layers} + k] = {pair}.weight * bilinear({image}, {pair}.fine, k);",
-        "}",
-    )
-    both = Value.of_array(out, 4 * layers + op.channels, code.lit)
-    return both[: op.channels] + both[4 * layers :]
+        at = f"{level} + {number(op.finer)}" if op.finer else str(level)
+        read = f"blended({image}, {code.let('Pair', code.pair(image, at, str(u)), 'pair')}, k)"
+    out = code.variable("float4", op.output, image.layers)
+    code.write(f"for (int k = 0; k < {image.layers}; k++) {out}[k] = {read};")
+    return Value.of_array(out, op.channels, code.lit)
 
 
 @SHADER.implements(ops.SurfaceMaps)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import RunPython
 from support.fit_data import parallax, write_data
 
 from mbtf_core.app.console import run
@@ -38,6 +39,18 @@ def test_the_error_is_that_of_the_prediction_alone(shards: Path, tmp_path: Path)
     assert errors["n"] == 1500
     assert abs(errors["mse"]["value"] - OFFSET**2) < 4 * errors["mse"]["error"] < OFFSET**2
     assert math.isclose(errors["unexplained"]["value"], OFFSET**2 / value.var(0).mean(), rel_tol=0.3)
+
+
+def test_foreign_predictions_are_scored_without_the_fitter(
+    shards: Path, tmp_path: Path, run_python: RunPython
+) -> None:
+    """Neither models nor training have a part in the errors of foreign code."""
+    np.savez(tmp_path / "mine.npz", value=exact(shards))
+    code = "import sys; from mbtf_fit.evaluation import score_predictions; score_predictions(*sys.argv[1:])"
+    rooms = "{m.split('.')[1] for m in sys.modules if m.startswith('mbtf_fit.')}"
+    shown = f"{code}; print({rooms} & {{'models', 'pytorch', 'training'}})"
+    done = run_python("-c", shown, str(tmp_path / "mine.npz"), str(shards))
+    assert done.stdout.strip() == "set()", done.stderr
 
 
 def test_what_cannot_be_scored_is_refused(shards: Path, tmp_path: Path) -> None:

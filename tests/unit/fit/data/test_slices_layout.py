@@ -72,6 +72,21 @@ def test_a_batch_decodes_pairs_of_whole_slices(tmp_path: Path) -> None:
     assert torch.equal(next(shared.batches(640, 1, 4)).values, 2 * next(slices.batches(640, 1, 4)).values)
 
 
+def test_slices_are_queries_in_random_order(tmp_path: Path) -> None:
+    data = Dataset.open(write_slices(tmp_path / "data", place, aspect=0.5))
+    slices = load_training(data, HeldOutSection(queries=0.05), 0).training
+    assert isinstance(slices, TrainingSlices)
+    queries = slices.as_queries(data.lattice, 3)
+    expected = place(queries.u.numpy(), None, queries.omega_i.numpy(), queries.omega_o.numpy())
+    np.testing.assert_allclose(queries.value.numpy(), expected, atol=1e-6)
+    assert len(torch.unique(torch.cat([queries.u, queries.omega_i, queries.omega_o], 1), dim=0)) == len(
+        slices
+    )
+    # A batch has queries of the whole tile.
+    assert queries.u[:200].std(0).numpy() == pytest.approx(12**-0.5, abs=0.05)
+    assert not torch.equal(queries.u, slices.as_queries(data.lattice, 4).u)
+
+
 @pytest.mark.parametrize(
     ("name", "changed", "message"),
     [

@@ -43,7 +43,7 @@ SHAPES: dict[str, dict[str, Any]] = {
     "flat tile": {"case": "neumip", "aspect": 0.1},
     "tall surface": {"case": "relief", "aspect": 2.3},
     **{f"one texel, {case}": {"case": case, "finest": 0} for case in ("neumip", "relief", "calibrated")},
-    "one texel, concatenated": {"case": "concatenated, softplus", "finest": 0},
+    "one texel, four levels": {"case": "four levels, softplus", "finest": 0},
 }
 SHAPES |= {case: {"case": case} for case in ALL.keys() - HIERARCHICAL.keys()}
 UNROLLED = ("neumip", "relief")

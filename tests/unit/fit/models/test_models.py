@@ -29,7 +29,7 @@ VARIANTS: dict[str, tuple[str, dict[str, Any]]] = {
     "neumip": of("neumip"),
     "six outputs": of("neumip", output_channels=6),
     "direct offset": of("neumip", offset="direct", activation="leaky-relu", output_transform="softplus"),
-    "concatenated": of("neumip", blending="concatenate", activation="sine", output_transform="exp"),
+    "four levels": of("quartesan2022", output_transform="exp"),
     "encoded": of(
         "neumip", encoding={"position": 2, "direction": 2, "raw": True, "direction_xyz": True, "pi": False}
     ),

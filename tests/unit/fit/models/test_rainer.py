@@ -119,6 +119,13 @@ def test_a_smooth_material_is_learned_and_loads_again(name: str, tmp_path: Path)
     assert not any("encoder" in key for key in material.description["weights"]["shapes"])
 
 
+def test_a_model_of_queries_is_trained_on_slices(tmp_path: Path) -> None:
+    """It is evaluated between the texels and directions, and at levels that no slice has."""
+    shards = write_slices(tmp_path / "data", noise=0.002, finest=3, lights=12)
+    result = fit(config("neumip-baseline"), shards, tmp_path / "fit")
+    assert result.errors["test"]["unexplained"]["value"] < 0.15
+
+
 def dark(u: Any, sigma: Any, omega_i: Any, omega_o: Any) -> Any:
     """Another material, a tenth as bright."""
     return 0.1 * spots(1.0 - u, sigma, omega_i, omega_o)

@@ -301,13 +301,14 @@ def test_nan_does_not_read_outside_the_tables(bad: float, name: str) -> None:
 def test_unsupported_options_use_pytorch() -> None:
     options: list[dict[str, Any]] = [
         *({"activation": "leaky-relu"}, {"output_channels": 6}, {"output_transform": "exp"}),
-        *({"offset": "direct"}, {"blending": "concatenate"}, {"width": 129}, {"layers": 16, "width": 500}),
+        *({"offset": "direct"}, {"width": 129}, {"layers": 16, "width": 500}),
         *({"encoding": {"position": 2}}, {"encoding": {"direction": 1}}),
     ]
     for option in options:
         model = build_model("neumip", LATTICE, **option)
         assert not supports(model), option
-    assert not supports(build_model("hierarchical", LATTICE))
+    for other in ("hierarchical", "quartesan2022"):
+        assert not supports(build_model(other, LATTICE))
     assert not supports(build_model("neumip", LATTICE).double())
     known: list[dict[str, Any]] = [{"offset": "none"}, {"channels": 64, "width": 128, "layers": 16}]
     known.append({"encoding": {"direction_xyz": True}})

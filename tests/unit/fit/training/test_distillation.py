@@ -15,10 +15,13 @@ from mbtf_fit.ops import Lookup, Network
 from mbtf_fit.ops.operation import Operation, sizes_of
 
 
-@pytest.mark.parametrize(("steps", "sampled"), [(20, True), (8, False)])
-def test_fits_have_a_sampler_but_short_ones(steps: int, sampled: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("steps", "wanted", "sampled"), [(20, True, True), (8, True, False), (20, False, False)]
+)
+def test_fits_have_a_sampler_but_short_ones(steps: int, wanted: bool, sampled: bool, tmp_path: Path) -> None:
     data = write_data(tmp_path / "data", parallax, train=20_000)
-    config = FitConfig.model_validate({"model": "neumip", "training": {"steps": steps}})
+    training = {"steps": steps, "importance_sampling": wanted}
+    config = FitConfig.model_validate({"model": "neumip", "training": training})
     sampler = fit(config, data, tmp_path / "fit").material.sampler
     assert (sampler is not None) == sampled
     if sampler is not None:

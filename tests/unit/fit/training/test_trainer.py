@@ -213,7 +213,7 @@ def test_noise_per_query_increases_regularization(
     ("model", "network", "columns"),
     [
         ("neumip", {}, {"decoder.0.weight": [*range(7)], "offset_network.0.weight": [*range(7)]}),
-        ("neumip-baseline", {"blending": "concatenate"}, {"decoder.0.weight": [*range(14)]}),
+        ("quartesan2022", {"offset": "none"}, {"decoder.0.weight": [*range(16)]}),
         ("relief", {}, {"decoder.0.weight": [*range(8), *range(20, 32)]}),
         ("hierarchical", {"offset": "none"}, {"decoder.first.weight": [*range(47)]}),
     ],
