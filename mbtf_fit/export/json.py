@@ -35,7 +35,7 @@ def write(export: Export, options: None) -> list[str]:
     document = {
         "format": "mbtf-layers",
         "schema": _SCHEMA,
-        "precision": "float16" if export.half else "float32",
+        "precision": export.form,
         **describe_model(material.model),
         "textures": [name for name, tensor in weights.items() if tensor.ndim == 3],
         "tensors": {name: _numbers(tensor.cpu()) for name, tensor in weights.items() if tensor.ndim != 3},

@@ -132,6 +132,16 @@ def doubled_scatter(center, moments):
     return 2 * np.array([[xx, xy], [xy, yy]])
 
 
+def texels_of_blocks(blocks, rows, columns, channels):
+    """Numbers from 0 to 1 of BC4 blocks: two end points, and 3 bits per texel."""
+    first, last = np.moveaxis(blocks[..., :2] / 255, -1, 0)[..., None]
+    bits = np.unpackbits(blocks[..., 2:], axis=-1, bitorder="little")
+    code = bits.reshape(*bits.shape[:-1], 16, 3) @ [1, 2, 4]
+    step = np.array([0, 7, 1, 2, 3, 4, 5, 6])[code] / 7
+    texels = (first + (last - first) * step).reshape(*code.shape[:-1], 4, 4).transpose(0, 3, 1, 4, 2)
+    return texels.reshape(4 * len(blocks), -1, channels)[:rows, :columns]
+
+
 class NumpyMaterial:
     """Content of material.json, and arrays by name; methods below `read` are operations."""
 
@@ -143,7 +153,15 @@ class NumpyMaterial:
     @classmethod
     def load(cls, folder):
         about = json.loads(Path(folder, "material.json").read_text())
-        return cls(about, load_file(Path(folder, "weights.safetensors")))
+        stored, tensors = load_file(Path(folder, "weights.safetensors")), {}
+        for name, shape in about["weights"]["shapes"].items():
+            tensors[name] = stored[name]
+            if stored[name].dtype.kind == "u":
+                low, high = stored[name.rstrip("0123456789").rstrip(".") + ".range"].astype(float)
+                shares = texels_of_blocks(stored[name], *shape) if stored[name].ndim == 4 else stored[name]
+                largest = 1 if stored[name].ndim == 4 else np.iinfo(shares.dtype).max
+                tensors[name] = np.float32(low + (high - low) * (shares / largest))
+        return cls(about, tensors)
 
     def evaluate(self, u, sigma, omega_i, omega_o):
         level = np.clip(-np.log2(2.0 * sigma), 0, self.finest)[:, None]
