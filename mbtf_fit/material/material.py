@@ -296,7 +296,7 @@ def describe_model(model: NeuralMaterial) -> dict[str, Any]:
     }
 
 
-def _stored(weights: dict[str, Tensor], form: TextureFormat) -> dict[str, Tensor]:
+def stored_tensors(weights: dict[str, Tensor], form: TextureFormat) -> dict[str, Tensor]:
     """Tensors as a file has them, with the ranges of quantized textures."""
     if form == "float16":
         return {name: tensor.half() if tensor.ndim else tensor for name, tensor in weights.items()}
@@ -344,7 +344,7 @@ def export(
     conformance = {f"conformance.{k}": torch.from_numpy(v) for k, v in queries.items()}
     texels, others = model.parameter_groups()
     # The description names the weights' digest, so it comes last: a folder with one is complete.
-    written = write_tensors(folder / WEIGHTS_NAME, {**_stored(weights, form), **conformance}, {})
+    written = write_tensors(folder / WEIGHTS_NAME, {**stored_tensors(weights, form), **conformance}, {})
     write_json(
         folder / DESCRIPTION_NAME,
         {
