@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mbtf_core.errors import InputError
 from mbtf_fit.material.material import Material, conformance_values
-from mbtf_fit.material.texture_formats import TextureFormat, grouped, round_levels
+from mbtf_fit.material.texture_formats import QUANTIZED, TextureFormat, grouped, round_levels
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def round_weights(weights: Mapping[str, Tensor], form: TextureFormat) -> dict[st
     ------
     InputError : a number is beyond half precision
     """
-    if form in ("float32", "float16"):
+    if form not in QUANTIZED:
         return {n: t if form == "float32" else _round_to_half(n, t) for n, t in weights.items()}
     out = dict(weights)
     for texture, names in grouped(weights).items():

@@ -6,8 +6,8 @@ channel of 4 × 4 texels in 8 bytes: two end points of 8 bits, and 3 bits per te
 (Direct3D's ``BC4_UNORM``). Learned channels differ from each other. BC7, in which up to four channels share
 lines, takes half the bytes of BC4 and makes three to five times the error.
 
-Heights have 16 bits in both formats, as view rays are traced to them. What has been decoded is encoded to the
-same numbers again: end points are the extremes of a block.
+Heights have 16 bits in both formats, as view rays are traced to them, and slopes 8, as highlights depend on
+them. What has been decoded is encoded to the same numbers again: end points are the extremes of a block.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_fit.ops.constants import HEIGHTS
+from mbtf_fit.ops.constants import HEIGHTS, MAPS
 
 TextureFormat = Literal["float32", "float16", "unorm8", "bc4"]
 TEXTURE_FORMATS: tuple[TextureFormat, ...] = get_args(TextureFormat)
@@ -28,12 +28,15 @@ QUANTIZED: tuple[TextureFormat, ...] = ("unorm8", "bc4")
 BLOCK, STEPS = 4, 7
 # Difference of places that single precision explains.
 _EXACT = 0.01
-# Ending of the names of ranges.
-RANGE = ".range"
+# Endings of the names of ranges, and of channels that have 8 bits beside blocks: the first ones of the maps,
+# distributions of slopes. In blocks they add 6% to the error of glossy `turtle_shell`.
+RANGE, PRECISE = ".range", ".precise"
+_PRECISE_CHANNELS = {MAPS: 5}
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
+Codes = dict[str, NDArray[Any]]
 
 
 def encode_blocks(numbers: F64) -> U8:
@@ -70,7 +73,7 @@ def decode_blocks(blocks: U8, rows: int, columns: int) -> NDArray[np.int64]:
     return whole[:rows, :columns]
 
 
-def encode(name: str, levels: Sequence[F32], form: TextureFormat) -> tuple[list[NDArray[Any]], F32]:
+def encode(name: str, levels: Sequence[F32], form: TextureFormat) -> tuple[list[Codes], F32]:
     """A texture in a format of :data:`QUANTIZED`.
 
     Parameters
@@ -81,46 +84,49 @@ def encode(name: str, levels: Sequence[F32], form: TextureFormat) -> tuple[list[
 
     Returns
     -------
-    (list of array, (2, channels) array)
-        Integers of each level, and the channels' range: low, then high.
+    (list of dict, (2, channels) array)
+        Integers of each level by what follows its name, and the channels' range: low, then high.
     """
     limits = np.stack([[x.min((0, 1)) for x in levels], [x.max((0, 1)) for x in levels]])
     low, high = limits[0].min(0).astype(np.float64), limits[1].max(0).astype(np.float64)
-    scale = (65535 if name == HEIGHTS else 255) / np.where(high > low, high - low, 1.0)
-    numbers = [(x - low) * scale for x in levels]
+    scale = 1.0 / np.where(high > low, high - low, 1.0)
+    shares = [(x - low) * scale for x in levels]
     if name == HEIGHTS:
-        codes: list[NDArray[Any]] = [np.rint(x).astype(np.uint16) for x in numbers]
+        codes: list[Codes] = [{"": np.rint(65535.0 * x).astype(np.uint16)} for x in shares]
     elif form == "bc4":
-        codes = [encode_blocks(x) for x in numbers]
+        first = _PRECISE_CHANNELS.get(name, 0)
+        codes = [{"": encode_blocks(255.0 * x[..., first:])} for x in shares]
+        for level, x in zip(codes, shares, strict=True):
+            level |= {PRECISE: np.rint(255.0 * x[..., :first]).astype(np.uint8)} if first else {}
     else:
-        codes = [np.rint(x).astype(np.uint8) for x in numbers]
+        codes = [{"": np.rint(255.0 * x).astype(np.uint8)} for x in shares]
     return codes, np.stack([low, high]).astype(np.float32)
 
 
-def decode(code: NDArray[Any], limits: F32, shape: Sequence[int]) -> F32:
+def decode(codes: Mapping[str, NDArray[Any]], limits: F32, shape: Sequence[int]) -> F32:
     """A level (rows, columns, channels) of a texture from integers and range of :func:`encode`.
 
     Raises
     ------
-    ValueError : the integers have another shape
+    KeyError, ValueError : integers are missing, or have another shape
     """
-    if code.dtype == np.uint8 and code.ndim == 4:
-        rows, columns, channels = shape
-        if code.shape != (-(-rows // BLOCK), -(-columns // BLOCK), channels, 8):
-            raise ValueError(f"has blocks of the shape {code.shape}, of a texture {tuple(shape)}")
-        whole, largest = decode_blocks(code, rows, columns), STEPS * 255
+    code, rows, columns = codes[""], *shape[:2]
+    if code.ndim == 4:
+        if code.shape[:2] != (-(-rows // BLOCK), -(-columns // BLOCK)) or code.shape[3] != 8:
+            raise ValueError(f"has blocks of the shape {code.shape}")
+        share = decode_blocks(code, rows, columns) / (255 * STEPS)
     else:
-        whole, largest = code.astype(np.int64), np.iinfo(code.dtype).max
+        share = code / np.iinfo(code.dtype).max
+    if PRECISE in codes:
+        share = np.concatenate([codes[PRECISE] / 255, share], -1)
+    if share.shape != tuple(shape):
+        raise ValueError(f"has the shape {share.shape} in place of {tuple(shape)}")
     low, high = limits.astype(np.float64)
-    return (low + (high - low) * (whole / largest)).astype(np.float32)
+    return (low + (high - low) * share).astype(np.float32)
 
 
 def round_levels(name: str, levels: Sequence[F32], form: TextureFormat) -> list[F32]:
-    """Levels (rows, columns, channels) of a texture as a reader of a format gets them."""
-    if form == "float32":
-        return [*levels]
-    if form == "float16":
-        return [x.astype(np.float16).astype(np.float32) for x in levels]
+    """Levels (rows, columns, channels) of a texture as a reader of a quantized format gets them."""
     codes, limits = encode(name, levels, form)
     return [decode(code, limits, x.shape) for code, x in zip(codes, levels, strict=True)]
 
