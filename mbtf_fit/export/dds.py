@@ -28,7 +28,7 @@ from mbtf_fit.ops.constants import HEIGHTS, HORIZONS, MAPS
 
 _TEXTURES = ("pyramid", "offset_texture", "features", MAPS, HORIZONS, HEIGHTS)
 _NAMES = [f"{name}.dds" for name in (*_TEXTURES, MAPS + PRECISE)]
-# DXGI_FORMAT by bytes of a texel or block, channels of a slice, and whether numbers are in blocks.
+# DXGI_FORMAT by bytes of a channel's texel or block, and channels of a slice.
 _FORMATS = {(1, 1): 61, (1, 2): 49, (2, 1): 56, (8, 1): 80, (8, 2): 83}
 # Before the data.
 HEADER_BYTES = 148
@@ -82,8 +82,8 @@ def _check_mips(name: str, shapes: Sequence[tuple[int, ...]]) -> None:
 def write(export: Export, options: None) -> list[str]:
     """Write the textures, and ``layers.json`` with their ranges."""
     if export.form not in QUANTIZED:
-        what, hint = f"has no textures in {export.form}", "add --texture-format bc4, or unorm8"
-        raise UsageError(what, where="--to dds", hint=hint)
+        hint = "add --texture-format bc4, or unorm8"
+        raise UsageError(f"has no textures in {export.form}", where="--to dds", hint=hint)
     weights = export.material.model.weights()
     files = write_layers(export, None)
     layers = json.loads((export.folder / LAYERS_NAME).read_text(encoding="utf-8"))

@@ -213,10 +213,11 @@ class Trainer:
 
     def state(self) -> dict[str, Tensor]:
         """Tensors of a checkpoint, besides parameters."""
-        roundings = {f"rounding.{k}": t.rounding for k, t in enumerate(self.model.textures())}
-        kept = {name: tensor for name, tensor in roundings.items() if tensor is not None}
-        step = {} if self._rounded is None else {"rounded": torch.tensor(self._rounded)}
-        return {**self.hooks.state(), **kept, **step}
+        out = self.hooks.state() | (
+            {"rounded": torch.tensor(self._rounded)} if self._rounded is not None else {}
+        )
+        textures = enumerate(self.model.textures())
+        return out | {f"rounding.{k}": t.rounding for k, t in textures if t.rounding is not None}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
         """Inverse of :meth:`state`."""
