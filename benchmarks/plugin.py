@@ -2,6 +2,7 @@
 
     python benchmarks/plugin.py [--material FOLDER] [--runs 7] [--resolution 512] [--threads N]
     python benchmarks/plugin.py --model relief [--places 2]
+    python benchmarks/plugin.py --material FOLDER --shards SHARDS
 
 The queries are those of a perspective picture of the plane: 1920 × 1080 positions, footprints and views, one
 light. **unrolled** and **cooperative** are the plugin's ways to evaluate networks, **pytorch** is
@@ -11,6 +12,9 @@ material is a ``neumip`` of the paper's size with random weights, or one given.
 With ``--model relief`` the material has random heights besides, and ``neumip`` takes the place of PyTorch.
 **trace** (view rays alone) and **surface** (everything known of it) are parts of its time.
 
+With ``--shards``, formats of the material's textures are compared: error on test queries of these data,
+bytes, and the first picture (files are read, kernels are compiled already).
+
 The last line is one JSON object. Thresholds hold with two threads.
 """
 
@@ -19,6 +23,7 @@ from __future__ import annotations
 import os
 import statistics
 import tempfile
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -89,11 +94,50 @@ def random_material(folder: Path, levels: int, model: ModelName, network: dict[s
     export(built, config, folder, data={}, training=training)
 
 
+def compare_formats(material: Any, shards: Path, plugin: Any, runs: int) -> dict[str, dict[str, float]]:
+    """Error, bytes, and CPU time in milliseconds of a material by format of its textures."""
+    from mbtf_core.data.dataset import Dataset
+    from mbtf_core.stats import unexplained_variance
+    from mbtf_fit.backends.mitsuba import read_material
+    from mbtf_fit.data.loader import load_split
+    from mbtf_fit.material.material import export
+    from mbtf_fit.material.rounding import round_material
+    from mbtf_fit.material.texture_formats import TEXTURE_FORMATS
+
+    def fastest(way: Callable[[], Any]) -> float:
+        """A busy machine takes longer, but hardly more of its processors."""
+        times = []
+        for _ in range(runs):
+            start = time.process_time()
+            way()
+            times.append(time.process_time() - start)
+        return 1e3 * min(times)
+
+    def first_picture(folder: Path) -> None:
+        plugin(read_material(folder), "unrolled")()
+
+    rows = dict[str, dict[str, float]]()
+    queries = load_split(Dataset.open(shards), "test")
+    for form in TEXTURE_FORMATS:
+        folder = Path(_CACHE.name) / form
+        folder.mkdir()
+        made, _ = round_material(material, form)
+        export(made.model, made.config, folder, data={}, training=made.description["training"], form=form)
+        row = {"error": unexplained_variance(made.predict(queries), *queries.halves).value}
+        row["bytes"] = (folder / "weights.safetensors").stat().st_size
+        row["picture"] = fastest(plugin(read_material(folder), "unrolled"))
+        row["first"] = fastest(partial(first_picture, folder))
+        print(form, *(f"{name} {value:.5g}" for name, value in row.items()), flush=True)
+        rows[form] = row
+    return rows
+
+
 def main() -> int:
     parser = parser_of(__doc__)
     parser.add_argument("--model", choices=("neumip", "relief"), default="neumip")
     parser.add_argument("--places", type=int, choices=(1, 2, 4), default=1)
     parser.add_argument("--material", type=Path)
+    parser.add_argument("--shards", type=Path)
     parser.add_argument("--runs", type=int, default=7)
     parser.add_argument("--resolution", type=int, default=512, help="texels across, a power of two")
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
@@ -144,6 +188,8 @@ def main() -> int:
         evaluator = Evaluator(material, arithmetic)
         return evaluated(lambda: evaluator.value(evaluator.stage1(u, evaluator.level(sigma), view), light))
 
+    if options.shards is not None:
+        return finish(compare_formats(material, options.shards, plugin, options.runs), {}, None)
     ways: dict[str, Callable[[], Any]] = {
         "unrolled": plugin(stored, "unrolled"),
         "cooperative": plugin(stored, "cooperative"),

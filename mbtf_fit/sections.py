@@ -206,6 +206,13 @@ class TrainingSection(Settings):
         description="strength of the weight decay and blur that follow from noise and number of the queries; "
         "0: none",
     )
+    texture_format: Annotated[Literal["float32", "unorm8", "bc4"], Flag("--texture-format", rare=True)] = (
+        Field(
+            "float32",
+            description="format of the material's textures, to which training adapts: 32 bits, 8 bits, or 4 "
+            "bits in blocks that graphics hardware reads",
+        )
+    )
     warmup: int = Field(
         100,
         ge=0,

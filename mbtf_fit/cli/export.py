@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional, TypeVar
 from cyclopts import Group, Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import Output, Overwrite, Switch
+from mbtf_core.app.options import Output, Overwrite
 from mbtf_core.config.settings import Settings, build
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.files.folders import OutputKind
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_fit.export import Export, targets
+from mbtf_fit.material.texture_formats import TextureFormat
 
 if TYPE_CHECKING:
     Name = str
@@ -86,7 +87,7 @@ def export_material(
         ),
     ] = None,
     output: Annotated[Output | None, Parameter(show_default="the material's own")] = None,
-    half: Switch = False,
+    texture_format: Annotated[TextureFormat | None, Parameter(show_default="the material's own")] = None,
     flags: TargetFlags = TargetFlags(),  # noqa: B008
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
@@ -99,13 +100,15 @@ def export_material(
     ----------
     material
         Folder made by mbtf-fit.
-    half
-        Round all weights and texels to 16 bits first, and print the resulting error; not for web.
+    texture_format
+        Round the textures first, and print the resulting error; not for web. float16 rounds the networks too;
+        bc4 is read by graphics hardware.
     """
     from mbtf_core.files.atomic import file_sha256
     from mbtf_core.files.folders import OutputFolder, owned
     from mbtf_fit.material.format import DESCRIPTION_NAME
-    from mbtf_fit.material.material import Material, to_half
+    from mbtf_fit.material.material import Material
+    from mbtf_fit.material.rounding import round_material
 
     wanted = [targets()[name] for name in dict.fromkeys(to or ["exr", "json"])]
     for target in targets().values():
@@ -113,16 +116,16 @@ def export_material(
         if target.options and flags.given(target.options) and not {t.name for t in wanted} & set(users):
             flag = flag_of(next(iter(flags.given(target.options))))
             raise UsageError(f"is an option of {', '.join(users)}", where=flag, hint=f"add --to {users[0]}")
-        if half and target in wanted and not target.rounds:
+        if texture_format and target in wanted and not target.rounds:
             hint = "leave it out, or export the other formats by a command of their own"
-            raise UsageError(f"has no meaning for {target.name}", where="--half", hint=hint)
+            raise UsageError(f"has no meaning for {target.name}", where="--texture-format", hint=hint)
     options = [None if target.options is None else flags.section(target.options) for target in wanted]
     loaded, folder = Material.load(material), material if output is None else output
     keep_on_interruption(f"the finished files are kept in {folder}")
     depends = {
         "material": file_sha256(material / DESCRIPTION_NAME),
         "to": sorted(target.name for target in wanted),
-        "half": half,
+        "texture_format": texture_format,
         "options": {key: digest_of(v) for key, v in sorted(vars(flags).items()) if v is not None},
     }
     # Files of other formats may lie in the material's own folder.
@@ -144,8 +147,9 @@ def export_material(
         if claimed is not None:
             # Refuses to replace files that have changed.
             claimed.finished(EXPORT.format)
-        written, error = to_half(loaded) if half else (loaded, None)
-        export = Export(material, folder, written, half, _is_material(folder), console)
+        written, error = round_material(loaded, texture_format) if texture_format else (loaded, None)
+        form = texture_format or loaded.texture_format
+        export = Export(material, folder, written, form, _is_material(folder), console)
         if error is not None:
             export.notes.append(str(error))
         files: list[str] = []
@@ -155,7 +159,7 @@ def export_material(
             claimed.keep(EXPORT.format, [folder / name for name in dict.fromkeys(files)], {})
     sizes = {name: (folder / name).stat().st_size for name in dict.fromkeys(files)}
     lines = [f"{folder / name}: {size / 1e6:.3f} MB" for name, size in sizes.items()]
-    report = {"folder": folder, "files": sizes, "half": None if error is None else asdict(error)}
+    report = {"folder": folder, "files": sizes, "rounding": None if error is None else asdict(error)}
     console.report(report | export.report, "\n".join([*lines, *export.notes]))
 
 

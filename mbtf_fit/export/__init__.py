@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from mbtf_core.app.console import Console
 from mbtf_core.config.settings import Settings
+from mbtf_fit.material.texture_formats import TextureFormat
 
 if TYPE_CHECKING:
     from mbtf_fit.material.material import Material
@@ -29,8 +30,8 @@ class Export:
     ----------
     source : the material's folder
     folder : where to write
-    material : as it is written: rounded, with `half`
-    half : whether weights and texels are rounded to 16 bits
+    material : as it is written: rounded to the format
+    form : of textures, to which the material is rounded
     complete : whether the folder holds this export already, as a valid material
     console : for progress
     notes : lines for people, which targets add
@@ -41,7 +42,7 @@ class Export:
     source: Path
     folder: Path
     material: Material
-    half: bool
+    form: TextureFormat
     complete: bool
     console: Console
     notes: list[str] = field(default_factory=list)
@@ -60,7 +61,7 @@ class ExportTarget:
     files : names of all files that it may write
     write : writes them for an :class:`Export`, with its options, and returns the names of those written
     options : section whose fields are flags of the command; targets may share one
-    rounds : whether it can be written with ``--half``
+    rounds : whether it can be written with ``--texture-format``
     """
 
     name: str

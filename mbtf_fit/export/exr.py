@@ -47,7 +47,7 @@ def write(export: Export, options: None) -> list[str]:
     }
     parts = []
     for name, texture in texture_parts(export.material).items():
-        planes = np.moveaxis(texture.astype(np.float16 if export.half else np.float32), 2, 0)
+        planes = np.moveaxis(texture.astype(np.float16 if export.form == "float16" else np.float32), 2, 0)
         names = channel_names(name, len(planes))
         channels = {c: np.ascontiguousarray(plane) for c, plane in zip(names, planes, strict=True)}
         parts.append(OpenEXR.Part(dict(header), channels, name=name))

@@ -9,6 +9,7 @@ import numpy as np
 
 from mbtf_core.files.atomic import write_text
 from mbtf_fit.export import Export, ExportTarget
+from mbtf_fit.material.texture_formats import RANGE
 
 LAYERS_NAME = "layers.json"
 _SCHEMA = 6
@@ -21,24 +22,27 @@ def _numbers(array: Any) -> Any:
 
 
 def write(export: Export, options: None) -> list[str]:
-    """Write what evaluates a material, but for its textures: its operations, the tensors that they name, and
-    the conformance queries with their expected values, that of the transmittance included."""
+    """Write what evaluates a material, but for its textures: its operations, the tensors that they name, the
+    ranges of quantized textures, and the conformance queries with their expected values, that of the
+    transmittance included."""
     from mbtf_fit.export.checks import check_stored
-    from mbtf_fit.material.material import describe_model
+    from mbtf_fit.material.material import describe_model, stored_tensors
     from mbtf_fit.material.transmittance import FORMULA
 
     material = export.material
     weights, expected = material.model.weights(), dict(material.conformance)
-    through = material.transmittance
+    stored, through = stored_tensors(weights, export.form), material.transmittance
+    ranges = {n.removesuffix(RANGE): _numbers(t) for n, t in stored.items() if n.endswith(RANGE)}
     if through is not None:
         expected["transmittance"] = through.evaluate(*(expected[k] for k in ("u", "sigma", "omega_o")))
     document = {
         "format": "mbtf-layers",
         "schema": _SCHEMA,
-        "precision": "float16" if export.half else "float32",
+        "precision": export.form,
         **describe_model(material.model),
         "textures": [name for name, tensor in weights.items() if tensor.ndim == 3],
         "tensors": {name: _numbers(tensor.cpu()) for name, tensor in weights.items() if tensor.ndim != 3},
+        **({"ranges": ranges} if ranges else {}),
         **({} if through is None else {"transmittance": FORMULA}),
         "conformance": {
             **{name: _numbers(array) for name, array in expected.items()},

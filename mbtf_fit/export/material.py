@@ -21,7 +21,7 @@ def write(export: Export, options: None) -> list[str]:
             export.folder,
             data=description["data"],
             training=description["training"],
-            half=export.half,
+            form=export.form,
             transmittance=material.transmittance,
             sampler=material.sampler,
         )

@@ -38,7 +38,9 @@ def write(export: Export, options: ShaderOptions) -> list[str]:
         what = f"Slang has no cooperative vectors for {without[0]}"
         raise UsageError(what, where="--shader-networks", hint="export that language by a command of its own")
     check_shaders(export.material, export.folder / MODULE_NAME)
-    return write_module(export.material, export.folder, targets, half=export.half, cooperative=cooperative)
+    return write_module(
+        export.material, export.folder, targets, half=export.form == "float16", cooperative=cooperative
+    )
 
 
 TARGET = ExportTarget(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from mbtf_core.config.settings import leaves
 from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig, decoder_models, stored_config
-from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME, read_description, read_weights
+from mbtf_fit.material.format import DESCRIPTION_NAME, read_description, read_weights
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -88,7 +88,8 @@ class Decoder:
         ------
         InputError : a tensor is missing
         """
-        given = read_weights(self.folder / WEIGHTS_NAME)
+        description, weights = read_description(self.folder)
+        given = read_weights(weights, description)
         for name, tensor in network_tensors(model).items():
             if name not in given or given[name].shape != tensor.shape:
                 raise InputError(f"its network lacks '{name}'", where=self.folder, hint="fit it again")

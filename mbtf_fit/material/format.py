@@ -19,6 +19,7 @@ from mbtf_core.data.lattice import MAX_LEVEL, Lattice
 from mbtf_core.errors import InputError, reason
 from mbtf_core.files.atomic import Stored, file_sha256, read_json, write_chunks
 from mbtf_core.paths import refuse_special, suggest_path
+from mbtf_fit.material.texture_formats import PRECISE, RANGE, TextureFormat, decode, range_name
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -46,6 +47,7 @@ class _File(BaseModel):
 
 
 class _Weights(_File):
+    dtype: TextureFormat
     network_weights: int
     texels: int
 
@@ -204,14 +206,30 @@ def read_tensors(path: Path, framework: str = "pt") -> tuple[dict[str, Any], dic
         raise InputError(f"cannot be read as tensors ({reason(error)})", where=path) from None
 
 
-def read_weights(path: Path, framework: str = "pt") -> dict[str, Any]:
-    """Tensors of a material, as :func:`read_tensors`.
+def read_weights(path: Path, description: Mapping[str, Any], framework: str = "pt") -> dict[str, Any]:
+    """Tensors of a described material, as :func:`read_tensors`; quantized textures as the floats that they
+    stand for.
 
     Raises
     ------
     InputError : missing or corrupt, or a tensor has other numbers than finite floats
     """
     tensors, _ = read_tensors(path, framework)
+    ranges = {name: np.asarray(tensors.pop(name)) for name in [*tensors] if name.endswith(RANGE)}
+    precise = {name: np.asarray(tensors.pop(name)) for name in [*tensors] if name.endswith(PRECISE)}
+    for name in [name for name, t in tensors.items() if "uint" in str(t.dtype)] if ranges else []:
+        try:
+            codes = {"": np.asarray(tensors[name])}
+            codes |= {PRECISE: precise[name + PRECISE]} if name + PRECISE in precise else {}
+            texels = decode(codes, ranges[range_name(name)], description["weights"]["shapes"][name])
+        except (KeyError, ValueError, TypeError) as error:
+            what = f"its quantized texture '{name}' cannot be decoded ({reason(error)})"
+            raise InputError(what, where=path, hint=AGAIN) from None
+        tensors[name] = texels
+        if framework == "pt":
+            import torch
+
+            tensors[name] = torch.from_numpy(texels)
     for name, tensor in tensors.items():
         try:
             array = np.asarray(tensor)

@@ -1,10 +1,10 @@
-"""The fitted material: its folder, which renderers read, its evaluation, and half precision."""
+"""The fitted material: its folder, which renderers read, and its evaluation."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ from mbtf_fit.material.format import (
 )
 from mbtf_fit.material.inference import evaluate_in_chunks, predict
 from mbtf_fit.material.sampler import Sampler, is_of_sampler
+from mbtf_fit.material.texture_formats import QUANTIZED, RANGE, TextureFormat, encode, grouped
 from mbtf_fit.material.transmittance import (
     TRANSMITTANCE_NAME,
     Transmittance,
@@ -174,11 +175,11 @@ class Material:
                 )
         except (ValueError, TypeError, RuntimeError) as error:
             raise InputError(reason(error), where=weights.with_name(DESCRIPTION_NAME), hint=AGAIN) from None
-        if 2 * sum(p.numel() for p in model.parameters()) > weights.stat().st_size:
+        if sum(p.numel() for p in model.parameters()) > 2 * weights.stat().st_size:
             what = f"is too small for the operations and levels that {DESCRIPTION_NAME} describes"
             raise InputError(what, where=weights, hint=AGAIN)
         model.to_empty(device="cpu")
-        tensors = read_weights(weights)
+        tensors = read_weights(weights, description)
         conformance = check_conformance(tensors, description, weights)
         own = {n: t for n, t in tensors.items() if not n.startswith("conformance.") and not is_of_sampler(n)}
         model.load_weights(own)
@@ -197,6 +198,12 @@ class Material:
     def lattice(self) -> Lattice:
         """Texel grids of the tile."""
         return self.model.lattice
+
+    @property
+    def texture_format(self) -> TextureFormat:
+        """Format of the stored textures."""
+        form: TextureFormat = self.description["weights"]["dtype"]
+        return form
 
     def evaluate(
         self, u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike
@@ -289,6 +296,19 @@ def describe_model(model: NeuralMaterial) -> dict[str, Any]:
     }
 
 
+def stored_tensors(weights: dict[str, Tensor], form: TextureFormat) -> dict[str, Tensor]:
+    """Tensors as a file has them, with the ranges of quantized textures."""
+    if form == "float16":
+        return {name: tensor.half() if tensor.ndim else tensor for name, tensor in weights.items()}
+    out = dict(weights)
+    for texture, names in grouped(weights).items() if form in QUANTIZED else ():
+        codes, limits = encode(texture, [weights[name].cpu().numpy() for name in names], form)
+        for name, level in zip(names, codes, strict=True):
+            out |= {name + ending: torch.from_numpy(code) for ending, code in level.items()}
+        out[texture + RANGE] = torch.from_numpy(limits)
+    return out
+
+
 def export(
     model: NeuralMaterial,
     config: FitConfig,
@@ -296,7 +316,7 @@ def export(
     *,
     data: dict[str, Any],
     training: dict[str, Any],
-    half: bool = False,
+    form: TextureFormat = "float32",
     transmittance: Transmittance | None = None,
     sampler: Sampler | None = None,
 ) -> Material:
@@ -306,7 +326,7 @@ def export(
     ----------
     data : identity of the data set
     training : summary of the training: steps, seconds, errors
-    half : store 16-bit floats; the weights are rounded already
+    form : of the textures, to which they are rounded already
 
     Raises
     ------
@@ -321,13 +341,11 @@ def export(
     if sampler is not None:
         extra[SAMPLER] = [op.as_json() for op in sampler.operations]
         weights |= sampler.tensors
-    if half:
-        weights = {name: tensor.half() if tensor.ndim else tensor for name, tensor in weights.items()}
     queries["rgb"] = conformance_values(model, queries)
     conformance = {f"conformance.{k}": torch.from_numpy(v) for k, v in queries.items()}
     texels, others = model.parameter_groups()
     # The description names the weights' digest, so it comes last: a folder with one is complete.
-    written = write_tensors(folder / WEIGHTS_NAME, {**weights, **conformance}, {})
+    written = write_tensors(folder / WEIGHTS_NAME, {**stored_tensors(weights, form), **conformance}, {})
     write_json(
         folder / DESCRIPTION_NAME,
         {
@@ -337,7 +355,7 @@ def export(
             "weights": {
                 "file": WEIGHTS_NAME,
                 "sha256": written.sha256,
-                "dtype": "float16" if half else "float32",
+                "dtype": form,
                 "shapes": {name: list(tensor.shape) for name, tensor in weights.items()},
                 "network_weights": sum(p.numel() for p in others),
                 "texels": sum(p.numel() for p in texels),
@@ -355,65 +373,3 @@ def export(
         },
     )
     return Material.load(folder)
-
-
-@dataclass(frozen=True)
-class HalfError:
-    """Difference of half precision from single precision on the conformance queries.
-
-    Attributes
-    ----------
-    count : queries
-    largest : largest absolute difference, in 1/sr
-    rms : root mean square difference, in 1/sr
-    relative : that over the root mean square value; None where all values are 0
-    """
-
-    count: int
-    largest: float
-    rms: float
-    relative: float | None
-
-    def __str__(self) -> str:
-        share = "" if self.relative is None else f" ({self.relative:.2g} of the rms value)"
-        return (
-            f"half precision: rms error {self.rms:.2g} 1/sr{share}, largest {self.largest:.2g} 1/sr, against "
-            f"single precision on {self.count} conformance queries"
-        )
-
-
-def _round_to_half(name: str, tensor: Tensor) -> Tensor:
-    """A tensor rounded to 16-bit floats, in single precision; single numbers stay as they are."""
-    if tensor.ndim == 0:
-        return tensor
-    rounded = tensor.half().float()
-    if not bool(rounded.isfinite().all()):
-        raise InputError(
-            f"'{name}' holds {float(tensor.abs().max()):.3g}, beyond half precision (65504)",
-            hint="export it in single precision",
-        )
-    return rounded
-
-
-def to_half(material: Material) -> tuple[Material, HalfError]:
-    """The material with all weights and texels rounded to 16 bits, and the rounding error. Arithmetic stays
-    in single precision; the conformance values become those of the rounded material.
-
-    Raises
-    ------
-    InputError : a number is beyond half precision
-    """
-    model = material.model.empty_copy()
-    model.load_weights({name: _round_to_half(name, t) for name, t in material.model.weights().items()})
-    transmittance = material.transmittance
-    if transmittance is not None:
-        levels = enumerate(map(torch.from_numpy, transmittance.levels))
-        halves = [_round_to_half(f"transmittance.{s}", texels).numpy() for s, texels in levels]
-        transmittance = replace(transmittance, levels=halves)
-    before = material.conformance["rgb"].astype(np.float64)
-    after = conformance_values(model, material.conformance)
-    difference = after.astype(np.float64) - before
-    rms, power = float(np.sqrt((difference**2).mean())), float(np.sqrt((before**2).mean()))
-    error = HalfError(len(before), float(np.abs(difference).max()), rms, rms / power if power else None)
-    conformance = {**material.conformance, "rgb": after}
-    return replace(material, model=model, conformance=conformance, transmittance=transmittance), error

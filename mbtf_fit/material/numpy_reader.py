@@ -132,6 +132,20 @@ def doubled_scatter(center, moments):
     return 2 * np.array([[xx, xy], [xy, yy]])
 
 
+def texels_of_blocks(blocks, rows, columns, _):
+    """Numbers from 0 to 1 of BC4 blocks: two end points, and 3 bits per texel."""
+    first, last = np.moveaxis(blocks[..., :2] / 255, -1, 0)[..., None]
+    bits = np.unpackbits(blocks[..., 2:], axis=-1, bitorder="little")
+    code = bits.reshape(*bits.shape[:-1], 16, 3) @ [1, 2, 4]
+    step = np.array([0, 7, 1, 2, 3, 4, 5, 6])[code] / 7
+    texels = (first + (last - first) * step).reshape(*code.shape[:-1], 4, 4).transpose(0, 3, 1, 4, 2)
+    return texels.reshape(4 * len(blocks), -1, blocks.shape[2])[:rows, :columns]
+
+
+def unit_range(integers):
+    return integers / np.iinfo(integers.dtype).max
+
+
 class NumpyMaterial:
     """Content of material.json, and arrays by name; methods below `read` are operations."""
 
@@ -143,7 +157,17 @@ class NumpyMaterial:
     @classmethod
     def load(cls, folder):
         about = json.loads(Path(folder, "material.json").read_text())
-        return cls(about, load_file(Path(folder, "weights.safetensors")))
+        stored, tensors = load_file(Path(folder, "weights.safetensors")), {}
+        for name, shape in about["weights"]["shapes"].items():
+            tensors[name] = stored[name]
+            if stored[name].dtype.kind == "u":
+                low, high = stored[name.rstrip("0123456789").rstrip(".") + ".range"].astype(float)
+                blocks = stored[name].ndim == 4
+                share = texels_of_blocks(stored[name], *shape) if blocks else unit_range(stored[name])
+                if name + ".precise" in stored:
+                    share = join(unit_range(stored[name + ".precise"]), share)
+                tensors[name] = np.float32(low + (high - low) * share)
+        return cls(about, tensors)
 
     def evaluate(self, u, sigma, omega_i, omega_o):
         level = np.clip(-np.log2(2.0 * sigma), 0, self.finest)[:, None]

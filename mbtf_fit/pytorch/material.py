@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
@@ -235,8 +236,10 @@ class NeuralMaterial(nn.Module):
         return None if trace is None or shade is None else (trace, shade)
 
     def know(self, surface: KnownSurface) -> None:
-        """Set heights and maps of the surface."""
-        self.surface = surface
+        """Set heights and maps of the surface, without levels that no lookup reaches."""
+        finer = self.tracing is not None and self.tracing[1].finer > 0
+        reached = surface.maps[: self.lattice.finest + 1 + finer]
+        self.surface = surface if len(reached) == len(surface.maps) else replace(surface, maps=reached)
 
     @property
     def known(self) -> KnownSurface:

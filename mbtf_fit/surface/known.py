@@ -67,10 +67,10 @@ class KnownSurface:
 
     Attributes
     ----------
-    lattice : levels of the data; maps have one more
+    lattice : levels of the data
     heights : (H, W) tensor, z of the traced grid in tile widths; row 0 is the side ``v → 1``
     maps : tuple of (rows, columns, channels) tensors
-        Prefiltered maps by level, coarsest first: levels 0 to k + 1.
+        Prefiltered maps by level, coarsest first: levels 0 to k, or to k + 1 where lookups are finer.
     horizons : tuple of (rows, columns, 2·azimuths) tensors
         Prefiltered horizon angles in radians by level, then their squares: levels 0 to k.
     light_width : RMS angle per axis of the light kernel, in radians
@@ -149,7 +149,7 @@ class KnownSurface:
             heights,
             tuple(
                 _take(tensors, f"{MAPS}.{s}", (*finer.shape(s), *channels))
-                for s in (*levels, lattice.finest + 1)
+                for s in range(finer.finest + (f"{MAPS}.{finer.finest}" in tensors))
             ),
             tuple(_take(tensors, f"{HORIZONS}.{s}", (*lattice.shape(s), 2 * AZIMUTHS)) for s in levels),
             float(_take(tensors, LIGHT_WIDTH, ())),

@@ -67,6 +67,17 @@ class Loader:
             self.textures[name] = Textures(self.levels(name, grids, channels))
         return self.textures[name]
 
+    def grids(self, finer: int = 0) -> list[tuple[int, int]]:
+        """Rows and columns of the levels, and of so many finer ones."""
+        lattice = Lattice(self.lattice.finest + finer, self.lattice.aspect)
+        return [lattice.shape(s) for s in range(lattice.finest + 1)]
+
+    def maps(self, name: str, channels: int) -> Textures:
+        """Maps of a surface, which may have a level more."""
+        return self.texture(
+            name, self.grids(f"{name}.{self.lattice.finest + 1}" in self.stored.tensors), channels
+        )
+
     def scalar(self, name: str) -> float:
         """A tensor ()."""
         return float(self.stored.take(name, ()))

@@ -30,8 +30,7 @@ def _lookup(op: ops.Lookup, loader: Loader) -> Step:
 
 @MITSUBA.implements(ops.SurfaceMaps)
 def _surface_maps(op: ops.SurfaceMaps, loader: Loader) -> Step:
-    finer = Lattice(loader.lattice.finest + 1, loader.lattice.aspect)
-    maps = loader.texture(op.maps, [finer.shape(s) for s in range(finer.finest + 1)], op.channels)
+    maps = loader.maps(op.maps, op.channels)
     return lambda u, level: maps.blended(mi.Point2f(*u), level[0] + op.finer)
 
 

@@ -10,7 +10,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import CLEARCOAT_F0
 from mbtf_core.errors import InputError
 from mbtf_fit import ops
@@ -65,8 +64,6 @@ class DirectLight:
 
 @MITSUBA.implements(ops.Shade)
 def _shade(op: ops.Shade, loader: Loader) -> Step:
-    finer = Lattice(loader.lattice.finest + 1, loader.lattice.aspect)
-    grids = [finer.shape(s) for s in range(finer.finest + 1)]
     first = loader.stored.tensors.get(f"{op.maps}.0", np.empty((1, 1, GLOSSY_CHANNELS)))
     channels = first.shape[-1]
     if channels not in MAP_CHANNELS:
@@ -75,9 +72,9 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
             f"{DIFFUSE_CHANNELS}, {GLOSSY_CHANNELS} or {COATED_CHANNELS}",
             where=loader.stored.folder / WEIGHTS_NAME,
         )
-    maps = loader.texture(op.maps, grids, channels)
+    maps = loader.maps(op.maps, channels)
     horizons = Textures(
-        [adjacent_azimuths(level) for level in loader.levels(op.horizons, grids[:-1], 2 * AZIMUTHS)],
+        [adjacent_azimuths(level) for level in loader.levels(op.horizons, loader.grids(), 2 * AZIMUTHS)],
         by_group=True,
     )
     width, f0 = loader.scalar(op.light_width), loader.scalar(op.dielectric)

@@ -96,7 +96,7 @@ def read_material(folder: str | Path) -> StoredMaterial:
     description, weights = read_description(folder)
     try:
         operations = read_operations(description["operations"])
-        tensors = read_weights(weights, "np")
+        tensors = read_weights(weights, description, "np")
         found = description.get(SAMPLER)
         sampler = [] if found is None else read_sampler(found, operations, tensors)
     except ValueError as error:

@@ -15,8 +15,10 @@ from mbtf_core.app.console import CONSOLE
 from mbtf_core.errors import InputError
 from mbtf_fit import Material
 from mbtf_fit.export import Export, targets
-from mbtf_fit.material.material import export, to_half
+from mbtf_fit.material.material import export
 from mbtf_fit.material.numpy_reader import NumpyMaterial
+from mbtf_fit.material.rounding import round_material
+from mbtf_fit.material.texture_formats import TextureFormat
 
 F64 = NDArray[np.float64]
 
@@ -63,16 +65,16 @@ class Reader(NumpyMaterial):
         return np.asarray(np.clip((c * np.stack([x**0, x, y, x * x, x * y, y * y], -1)).sum(-1), 0, 1))
 
 
-@pytest.mark.parametrize("half", [False, True], ids=["single", "half"])
+@pytest.mark.parametrize("form", ["float32", "float16", "bc4"])
 @pytest.mark.parametrize("case", CASES)
-def test_an_export_is_sufficient_for_evaluation(case: str, half: bool, tmp_path: Path) -> None:
+def test_an_export_is_sufficient_for_evaluation(case: str, form: TextureFormat, tmp_path: Path) -> None:
     """An evaluation written from the description alone, in NumPy, meets the conformance values."""
     material = make(case, tmp_path, contrast=1.0)
-    written = to_half(material)[0] if half else material
+    written, half = round_material(material, form)[0], form != "float32"
     for name in ("exr", "json"):
-        targets()[name].write(Export(tmp_path, tmp_path, written, half, False, CONSOLE), None)
+        targets()[name].write(Export(tmp_path, tmp_path, written, form, False, CONSOLE), None)
     reader = Reader(tmp_path)
-    assert reader.document["precision"] == ("float16" if half else "float32")
+    assert reader.document["precision"] == form
     expected = np.array(reader.document["conformance"]["rgb"])
     assert expected.std() > 0.005
     found = reader.value()
@@ -92,10 +94,10 @@ def test_an_export_is_sufficient_for_evaluation(case: str, half: bool, tmp_path:
 
 def test_a_material_in_half_precision_loads_like_any_other(tmp_path: Path) -> None:
     material = make("hierarchical", tmp_path / "single")
-    rounded, error = to_half(material)
+    rounded, error = round_material(material, "float16")
     (tmp_path / "half").mkdir()
     training = material.description["training"]
-    export(rounded.model, rounded.config, tmp_path / "half", data={}, training=training, half=True)
+    export(rounded.model, rounded.config, tmp_path / "half", data={}, training=training, form="float16")
     loaded = Material.load(tmp_path / "half")
     sizes = [(tmp_path / n / "weights.safetensors").stat().st_size for n in ("single", "half")]
     assert sizes[1] < 0.75 * sizes[0]
@@ -108,4 +110,6 @@ def test_a_material_in_half_precision_loads_like_any_other(tmp_path: Path) -> No
 
 def test_numbers_beyond_half_precision_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"'pyramid\.\d' holds .* beyond half precision"):
-        to_half(write_material(tmp_path, network={"output_transform": "identity"}, contrast=1e5))
+        round_material(
+            write_material(tmp_path, network={"output_transform": "identity"}, contrast=1e5), "float16"
+        )

@@ -45,7 +45,8 @@ def write(folder: Path, *last: Operation) -> Path:
 
 
 def command(material: Path, out: Path, name: str) -> int:
-    return run(app, ["export", str(material), "--to", name, "-o", str(out)])
+    options = ["--texture-format", "bc4"] if name == "dds" else []
+    return run(app, ["export", str(material), "--to", name, "-o", str(out), *options])
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,8 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_fit import ops
 from mbtf_fit.cli.app import app
 from mbtf_fit.config import FitConfig
-from mbtf_fit.material.material import Material, export, to_half
+from mbtf_fit.material.material import Material, export
+from mbtf_fit.material.rounding import round_material
 from mbtf_fit.pytorch.material import NeuralMaterial
 
 ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -83,7 +84,7 @@ def test_networks_are_those_of_the_material(
     assert run(app, ["export", str(folder), "--to", "rtxns", "-o", str(out)]) == 0
     left = "left out, as a single layer or more than 8: 'frames'"
     assert (left in capsys.readouterr().out) == (case == "zeltner2024")
-    rounded, _ = to_half(material)
+    rounded, _ = round_material(material, "float16")
     assert len(list(out.glob("network-*.json"))) == len(names)
     for k, name in enumerate(names):
         found = HostNetwork(out / f"network-{k + 1}.json")

@@ -247,7 +247,7 @@ def test_samplers_that_do_not_fit_are_refused(
         ("surface.heights", lambda a: a[:0], "is empty"),
         ("surface.heights", lambda a: a + 0.01, "has heights above the reference plane"),
         ("surface.heights", lambda a: np.where(a == a.min(), np.nan, a), "not finite"),
-        ("surface.maps.4", None, "lacks the tensor 'surface.maps.4'"),
+        ("surface.maps.3", None, "lacks the tensor 'surface.maps.3'"),
         ("surface.maps.0", lambda a: a[..., :9], "have 9 channels in place of 8, 10 or 12"),
         ("surface.dielectric", lambda a: a[None], "has the shape (1,)"),
     ],

@@ -20,7 +20,7 @@ from mbtf_fit.backends.shader.slang import SlangCompiler, module_of
 from mbtf_fit.backends.shader.syntax import ENDINGS, PLAIN_TARGETS
 from mbtf_fit.cli.app import app
 from mbtf_fit.material.format import QUERY
-from mbtf_fit.material.material import to_half
+from mbtf_fit.material.rounding import round_material
 from mbtf_fit.ops import Network
 from mbtf_fit.training.sampler import LightMixture, sampler_inputs
 
@@ -60,7 +60,7 @@ def test_half_precision(case: str, half: bool, cooperative: bool, tmp_path: Path
     material = make(case, tmp_path / "material")
     size = len(module_of(material)[1])
     if half:
-        material, _ = to_half(material)
+        material, _ = round_material(material, "float16")
     module, content = module_of(material, half=half)
     assert (len(content) < 0.7 * size) == half
     # HLSL's alignment of matrices.
@@ -213,7 +213,7 @@ MARKS = {
 }
 
 
-@pytest.mark.parametrize("more", [[], ["--half", "--shader-networks", "cooperative"]])
+@pytest.mark.parametrize("more", [[], ["--texture-format", "float16", "--shader-networks", "cooperative"]])
 def test_other_languages(
     more: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,0 +1,76 @@
+"""DDS files of quantized textures, read by independent decoders."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import imagecodecs
+import numpy as np
+import pytest
+from PIL import Image
+from support.plugin_materials import write_material
+
+from mbtf_core.app.console import CONSOLE, run
+from mbtf_core.errors import InputError, UsageError
+from mbtf_fit import Material
+from mbtf_fit.cli.app import app
+from mbtf_fit.export import Export, targets
+from mbtf_fit.export.dds import HEADER_BYTES
+from mbtf_fit.material.texture_formats import TextureFormat
+
+
+def test_hardware_textures_are_those_of_the_material(tmp_path: Path) -> None:
+    """Numbers of Pillow's and imagecodecs' decoders, with the ranges of layers.json, are the material's, but
+    for their rounding to 8 bits; a material that is exported in the same format has the same textures."""
+    write_material(tmp_path / "m", model="relief")
+    line = ["export", str(tmp_path / "m"), "--texture-format", "bc4", "-q"]
+    assert run(app, [*line, "--to", "dds", "--to", "material", "-o", str(tmp_path / "out")]) == 0
+    again = ["export", str(tmp_path / "out"), "--to", "dds", "-o", str(tmp_path / "again"), "-q"]
+    assert run(app, again) == 0
+    material = Material.load(tmp_path / "out")
+    assert material.texture_format == "bc4"
+    weights = material.model.weights()
+    ranges = json.loads((tmp_path / "out" / "layers.json").read_text())["ranges"]
+    assert {"pyramid", "surface.maps", "surface.horizons", "surface.heights"} == ranges.keys()
+    for name, first in (("pyramid", 0), ("surface.horizons", 0), ("surface.maps", 5)):
+        data = (tmp_path / "out" / f"{name}.dds").read_bytes()
+        assert (tmp_path / "again" / f"{name}.dds").read_bytes() == data
+        levels = sorted(n for n in weights if n.startswith(f"{name}."))
+        finest = weights[levels[-1]].numpy()[..., first:]
+        low, high = np.array(ranges[name])[:, first:]
+        pair = 2 - finest.shape[2] % 2
+        shown = np.atleast_3d(np.asarray(Image.open(io.BytesIO(data))))[..., :pair]
+        assert np.array_equal(np.atleast_3d(imagecodecs.dds_decode(data))[..., :pair], shown)
+        expected = 255 * (finest - low) / np.where(high > low, high - low, 1)
+        assert np.array_equal(shown, np.floor(expected[..., :pair] + 1e-3))
+        # The second level of the last slice, by its place in the file.
+        rows, columns, channels = finest.shape
+        blocks = [-(-max(rows >> k, 1) // 4) * -(-max(columns >> k, 1) // 4) for k in range(len(levels))]
+        assert len(data) == HEADER_BYTES + 8 * channels * sum(blocks)
+        start = HEADER_BYTES + 8 * ((channels - pair) * sum(blocks) + pair * blocks[0])
+        kind = imagecodecs.BCN.FORMAT.BC5 if pair == 2 else imagecodecs.BCN.FORMAT.BC4
+        part, shape = data[start : start + 8 * pair * blocks[1]], (rows // 2, columns // 2, pair)
+        found = np.asarray(imagecodecs.bcn_decode(part, kind, shape=shape[: pair + 1])).reshape(shape)
+        coarse = weights[levels[-2]].numpy()[..., first:]
+        expected = (coarse - low) / np.where(high > low, high - low, 1)
+        assert np.array_equal(found, np.floor(255 * expected[..., -pair:] + 1e-3))
+    heights = np.frombuffer(
+        (tmp_path / "out" / "surface.heights.dds").read_bytes(), np.uint16, -1, HEADER_BYTES
+    )
+    (low,), (high,) = ranges["surface.heights"]
+    expected = weights["surface.heights"].numpy().ravel()
+    np.testing.assert_allclose(low + (high - low) * heights / 65535, expected, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("form", "aspect", "fault"),
+    [("float32", 1.0, "no textures in float32"), ("bc4", 0.75, "are no mip levels")],
+)
+def test_what_hardware_cannot_read_is_refused(
+    form: TextureFormat, aspect: float, fault: str, tmp_path: Path
+) -> None:
+    material = write_material(tmp_path, aspect=aspect)
+    with pytest.raises((InputError, UsageError), match=fault):
+        targets()["dds"].write(Export(tmp_path, tmp_path, material, form, False, CONSOLE), None)
