@@ -70,7 +70,7 @@ def unequal(folder: Path) -> Material:
 @pytest.mark.parametrize(
     ("case", "names"),
     [
-        ("concatenated, softplus", ["offset_network", "decoder", "sampler"]),
+        ("four levels, softplus", ["offset_network", "decoder", "sampler"]),
         ("zeltner2024", ["decoder"]),
         ("unequal", ["mixed"]),
     ],

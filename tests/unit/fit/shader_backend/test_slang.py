@@ -52,7 +52,7 @@ def test_values_are_those_of_the_material(case: str, tmp_path: Path) -> None:
         ("relief", False, True),
         ("holes", True, True),
         ("direct offset, six outputs", True, True),
-        ("concatenated, softplus", False, True),
+        ("four levels, softplus", False, True),
     ],
 )
 def test_half_precision(case: str, half: bool, cooperative: bool, tmp_path: Path) -> None:
