@@ -34,6 +34,7 @@ from mbtf_fit.native import kernel
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel, typical_value, value_bound
 from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Batch, Workers
+from mbtf_fit.ops import Lookup
 from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.pytorch.textures import FeatureTextures, annealed_sigma
 from mbtf_fit.sections import TrainingSection
@@ -363,8 +364,9 @@ class Trainer:
     def fill_levels(self, coarsest: float) -> None:
         """Give levels of the pyramid below the fractional level of the data's largest footprint the averages
         of the next finer one. Measured BTFs have one footprint: their coarser levels would keep their initial
-        noise."""
-        self.model.textures()[0].average_coarser(math.floor(coarsest + _SAME_LEVEL))
+        noise. Levels that are read beside those of the footprint are trained, too."""
+        read = min((o.finer for o in self.model.operations if isinstance(o, Lookup)), default=0.0)
+        self.model.textures()[0].average_coarser(math.floor(coarsest + _SAME_LEVEL + read))
 
     def coverage(self) -> dict[int, float]:
         """Level → fraction of the pyramid's texels that have received gradients."""

@@ -55,6 +55,22 @@ def test_initial_blur_is_at_most_an_eighth(shape: tuple[int, int], asked: float,
     assert t._sigmas() == [max(start, 0.5) if x.moves_lookups else start for x in t.model.textures()]
 
 
+@pytest.mark.parametrize(("model", "trained"), [("neumip", 5), ("quartesan2022", 2)])
+def test_levels_that_no_lookup_of_the_data_reads_are_averages(model: str, trained: int) -> None:
+    """Of data with the footprint of level 5; `quartesan2022` reads the three coarser ones beside it."""
+    t = make_trainer(queries(500), Lattice(5), model, steps=40, batch=100)
+    pyramid = t.model.textures()[0]
+    before = pyramid.export()
+    t.fill_levels(5.0)
+    for level, texels in pyramid.export().items():
+        if int(level) >= trained:
+            assert torch.equal(texels, before[level])
+        else:
+            size = 2 ** (trained - int(level))
+            blocks = before[str(trained)].unfold(0, size, size).unfold(1, size, size)
+            torch.testing.assert_close(texels, blocks.mean((-2, -1)))
+
+
 def test_threads_share_a_batch_without_changing_its_gradient() -> None:
     data = queries(999)
     t = trainer(data)
