@@ -42,10 +42,9 @@ def dds_chunks(codes: Sequence[NDArray[Any]], shape: Sequence[int]) -> list[byte
     # (rows, columns, channels, bytes), finest first.
     levels = [c if c.ndim == 4 else c[..., None].view(np.uint8) for c in reversed(codes)]
     size = levels[0].shape[3]
-    rows, columns = shape
-    flags, capabilities = 0x21007, 0x401008
-    header = struct.pack("<4s7I44x", b"DDS ", 124, flags, rows, columns, 0, 0, len(levels))
-    header += struct.pack("<2I4s5I5I", 32, 4, b"DX10", 0, 0, 0, 0, 0, capabilities, 0, 0, 0, 0)
+    # Flags: which fields there are, and a texture with mip levels.
+    header = struct.pack("<4s7I44x", b"DDS ", 124, 0x21007, *shape, 0, 0, len(levels))
+    header += struct.pack("<2I4s5I5I", 32, 4, b"DX10", 0, 0, 0, 0, 0, 0x401008, 0, 0, 0, 0)
     header += struct.pack("<5I", _FORMATS[size, pair], 3, 0, channels // pair, 0)
     slices = [
         np.ascontiguousarray(level[:, :, first : first + pair]).tobytes()

@@ -29,7 +29,7 @@ BLOCK, STEPS = 4, 7
 # Difference of places that single precision explains.
 _EXACT = 0.01
 # Endings of the names of ranges, and of channels that have 8 bits beside blocks: the first ones of the maps,
-# distributions of slopes. In blocks they add 6% to the error of glossy `turtle_shell`.
+# distributions of slopes. In blocks they add a tenth to the error of glossy `turtle_shell`.
 RANGE, PRECISE = ".range", ".precise"
 _PRECISE_CHANNELS = {MAPS: 5}
 
