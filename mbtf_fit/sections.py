@@ -16,6 +16,7 @@ from mbtf_core.units import Size, format_duration, parse_duration
 OutputTransform = Literal["expm1", "exp", "identity", "softplus", "fourth-root"]
 LossKind = Literal["relative", "squared", "chroma", "linear", "log", "fourth-root", "gradient"]
 Correction = Literal["none", "linear"]
+TrainedFormat = Literal["float32", "unorm8", "bc4"]
 
 
 class EncodingSection(Settings):
@@ -206,12 +207,10 @@ class TrainingSection(Settings):
         description="strength of the weight decay and blur that follow from noise and number of the queries; "
         "0: none",
     )
-    texture_format: Annotated[Literal["float32", "unorm8", "bc4"], Flag("--texture-format", rare=True)] = (
-        Field(
-            "float32",
-            description="format of the material's textures, to which training adapts: 32 bits, 8 bits, or 4 "
-            "bits in blocks that graphics hardware reads",
-        )
+    texture_format: Annotated[TrainedFormat, Flag("--texture-format", rare=True)] = Field(
+        "float32",
+        description="format of the material's textures, to which training adapts: 32 bits, 8 bits, or 4 "
+        "bits in blocks that graphics hardware reads",
     )
     warmup: int = Field(
         100,

@@ -23,11 +23,11 @@ from mbtf_fit.export import Export, ExportTarget
 from mbtf_fit.export.checks import check_stored
 from mbtf_fit.export.json import LAYERS_NAME
 from mbtf_fit.export.json import write as write_layers
-from mbtf_fit.material.texture_formats import PRECISE, QUANTIZED, Codes, decode, encode, grouped
+from mbtf_fit.material.texture_formats import QUANTIZED, decode, encode, grouped
 from mbtf_fit.ops.constants import HEIGHTS, HORIZONS, MAPS
 
 _TEXTURES = ("pyramid", "offset_texture", "features", MAPS, HORIZONS, HEIGHTS)
-_NAMES = [f"{name}.dds" for name in (*_TEXTURES, MAPS + PRECISE)]
+_NAMES = [f"{name}.dds" for name in _TEXTURES]
 # DXGI_FORMAT by bytes of a channel's texel or block, and channels of a slice.
 _FORMATS = {(1, 1): 61, (1, 2): 49, (2, 1): 56, (8, 1): 80, (8, 2): 83}
 # Before the data.
@@ -42,10 +42,9 @@ def dds_chunks(codes: Sequence[NDArray[Any]], shape: Sequence[int]) -> list[byte
     # (rows, columns, channels, bytes), finest first.
     levels = [c if c.ndim == 4 else c[..., None].view(np.uint8) for c in reversed(codes)]
     size = levels[0].shape[3]
-    rows, columns = shape
-    flags, capabilities = 0x21007, 0x401008
-    header = struct.pack("<4s7I44x", b"DDS ", 124, flags, rows, columns, 0, 0, len(levels))
-    header += struct.pack("<2I4s5I5I", 32, 4, b"DX10", 0, 0, 0, 0, 0, capabilities, 0, 0, 0, 0)
+    # Flags: which fields there are, and a texture with mip levels.
+    header = struct.pack("<4s7I44x", b"DDS ", 124, 0x21007, *shape, 0, 0, len(levels))
+    header += struct.pack("<2I4s5I5I", 32, 4, b"DX10", 0, 0, 0, 0, 0, 0x401008, 0, 0, 0, 0)
     header += struct.pack("<5I", _FORMATS[size, pair], 3, 0, channels // pair, 0)
     slices = [
         np.ascontiguousarray(level[:, :, first : first + pair]).tobytes()
@@ -94,13 +93,10 @@ def write(export: Export, options: None) -> list[str]:
         levels = [weights[name].cpu().numpy() for name in names]
         _check_mips(texture, [x.shape for x in levels])
         codes, limits = encode(texture, levels, export.form)
-        found: list[Codes] = [{} for _ in codes]
-        for ending in codes[0]:
-            path, part = export.folder / f"{texture}{ending}.dds", [level[ending] for level in codes]
-            write_chunks(path, dds_chunks(part, levels[-1].shape[:2]))
-            files.append(path.name)
-            for level, integers in zip(found, read_dds(path.read_bytes(), part), strict=True):
-                level[ending] = integers
+        path = export.folder / f"{texture}.dds"
+        write_chunks(path, dds_chunks(codes, levels[-1].shape[:2]))
+        files.append(path.name)
+        found = read_dds(path.read_bytes(), codes)
         read |= {n: decode(c, limits, x.shape) for n, c, x in zip(names, found, levels, strict=True)}
     check_stored(layers, layers["tensors"] | read, export.material, export.folder / files[-1])
     return files

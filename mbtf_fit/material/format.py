@@ -19,7 +19,7 @@ from mbtf_core.data.lattice import MAX_LEVEL, Lattice
 from mbtf_core.errors import InputError, reason
 from mbtf_core.files.atomic import Stored, file_sha256, read_json, write_chunks
 from mbtf_core.paths import refuse_special, suggest_path
-from mbtf_fit.material.texture_formats import PRECISE, RANGE, TextureFormat, decode, range_name
+from mbtf_fit.material.texture_formats import RANGE, TextureFormat, decode, range_name
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -216,12 +216,10 @@ def read_weights(path: Path, description: Mapping[str, Any], framework: str = "p
     """
     tensors, _ = read_tensors(path, framework)
     ranges = {name: np.asarray(tensors.pop(name)) for name in [*tensors] if name.endswith(RANGE)}
-    precise = {name: np.asarray(tensors.pop(name)) for name in [*tensors] if name.endswith(PRECISE)}
     for name in [name for name, t in tensors.items() if "uint" in str(t.dtype)] if ranges else []:
         try:
-            codes = {"": np.asarray(tensors[name])}
-            codes |= {PRECISE: precise[name + PRECISE]} if name + PRECISE in precise else {}
-            texels = decode(codes, ranges[range_name(name)], description["weights"]["shapes"][name])
+            limits = ranges[range_name(name)]
+            texels = decode(np.asarray(tensors[name]), limits, description["weights"]["shapes"][name])
         except (KeyError, ValueError, TypeError) as error:
             what = f"its quantized texture '{name}' cannot be decoded ({reason(error)})"
             raise InputError(what, where=path, hint=AGAIN) from None

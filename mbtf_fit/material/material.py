@@ -303,8 +303,7 @@ def stored_tensors(weights: dict[str, Tensor], form: TextureFormat) -> dict[str,
     out = dict(weights)
     for texture, names in grouped(weights).items() if form in QUANTIZED else ():
         codes, limits = encode(texture, [weights[name].cpu().numpy() for name in names], form)
-        for name, level in zip(names, codes, strict=True):
-            out |= {name + ending: torch.from_numpy(code) for ending, code in level.items()}
+        out |= {name: torch.from_numpy(code) for name, code in zip(names, codes, strict=True)}
         out[texture + RANGE] = torch.from_numpy(limits)
     return out
 

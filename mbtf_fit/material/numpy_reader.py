@@ -142,10 +142,6 @@ def texels_of_blocks(blocks, rows, columns, _):
     return texels.reshape(4 * len(blocks), -1, blocks.shape[2])[:rows, :columns]
 
 
-def unit_range(integers):
-    return integers / np.iinfo(integers.dtype).max
-
-
 class NumpyMaterial:
     """Content of material.json, and arrays by name; methods below `read` are operations."""
 
@@ -163,9 +159,8 @@ class NumpyMaterial:
             if stored[name].dtype.kind == "u":
                 low, high = stored[name.rstrip("0123456789").rstrip(".") + ".range"].astype(float)
                 blocks = stored[name].ndim == 4
-                share = texels_of_blocks(stored[name], *shape) if blocks else unit_range(stored[name])
-                if name + ".precise" in stored:
-                    share = join(unit_range(stored[name + ".precise"]), share)
+                largest = 1 if blocks else np.iinfo(stored[name].dtype).max
+                share = (texels_of_blocks(stored[name], *shape) if blocks else stored[name]) / largest
                 tensors[name] = np.float32(low + (high - low) * share)
         return cls(about, tensors)
 

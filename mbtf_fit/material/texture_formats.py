@@ -6,8 +6,9 @@ channel of 4 × 4 texels in 8 bytes: two end points of 8 bits, and 3 bits per te
 (Direct3D's ``BC4_UNORM``). Learned channels differ from each other. BC7, in which up to four channels share
 lines, takes half the bytes of BC4 and makes three to five times the error.
 
-Heights have 16 bits in both formats, as view rays are traced to them, and slopes 8, as highlights depend on
-them. What has been decoded is encoded to the same numbers again: end points are the extremes of a block.
+Heights have 16 bits in both formats, as view rays are traced to them, and maps 8: highlights depend on their
+slopes and roughness, which in blocks add a tenth to the error of glossy `turtle_shell`. What has been decoded
+is encoded to the same numbers again: end points are the extremes of a block.
 """
 
 from __future__ import annotations
@@ -28,15 +29,12 @@ QUANTIZED: tuple[TextureFormat, ...] = ("unorm8", "bc4")
 BLOCK, STEPS = 4, 7
 # Difference of places that single precision explains.
 _EXACT = 0.01
-# Endings of the names of ranges, and of channels that have 8 bits beside blocks: the first ones of the maps,
-# distributions of slopes. In blocks they add 6% to the error of glossy `turtle_shell`.
-RANGE, PRECISE = ".range", ".precise"
-_PRECISE_CHANNELS = {MAPS: 5}
+# Ending of the names of ranges.
+RANGE = ".range"
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
-Codes = dict[str, NDArray[Any]]
 
 
 def encode_blocks(numbers: F64) -> U8:
@@ -73,7 +71,7 @@ def decode_blocks(blocks: U8, rows: int, columns: int) -> NDArray[np.int64]:
     return whole[:rows, :columns]
 
 
-def encode(name: str, levels: Sequence[F32], form: TextureFormat) -> tuple[list[Codes], F32]:
+def encode(name: str, levels: Sequence[F32], form: TextureFormat) -> tuple[list[NDArray[Any]], F32]:
     """A texture in a format of :data:`QUANTIZED`.
 
     Parameters
@@ -84,41 +82,36 @@ def encode(name: str, levels: Sequence[F32], form: TextureFormat) -> tuple[list[
 
     Returns
     -------
-    (list of dict, (2, channels) array)
-        Integers of each level by what follows its name, and the channels' range: low, then high.
+    (list of array, (2, channels) array)
+        Integers of each level, and the channels' range: low, then high.
     """
     limits = np.stack([[x.min((0, 1)) for x in levels], [x.max((0, 1)) for x in levels]])
     low, high = limits[0].min(0).astype(np.float64), limits[1].max(0).astype(np.float64)
     scale = 1.0 / np.where(high > low, high - low, 1.0)
     shares = [(x - low) * scale for x in levels]
     if name == HEIGHTS:
-        codes: list[Codes] = [{"": np.rint(65535.0 * x).astype(np.uint16)} for x in shares]
-    elif form == "bc4":
-        first = _PRECISE_CHANNELS.get(name, 0)
-        codes = [{"": encode_blocks(255.0 * x[..., first:])} for x in shares]
-        for level, x in zip(codes, shares, strict=True):
-            level |= {PRECISE: np.rint(255.0 * x[..., :first]).astype(np.uint8)} if first else {}
+        codes: list[NDArray[Any]] = [np.rint(65535.0 * x).astype(np.uint16) for x in shares]
+    elif form == "bc4" and name != MAPS:
+        codes = [encode_blocks(255.0 * x) for x in shares]
     else:
-        codes = [{"": np.rint(255.0 * x).astype(np.uint8)} for x in shares]
+        codes = [np.rint(255.0 * x).astype(np.uint8) for x in shares]
     return codes, np.stack([low, high]).astype(np.float32)
 
 
-def decode(codes: Mapping[str, NDArray[Any]], limits: F32, shape: Sequence[int]) -> F32:
+def decode(code: NDArray[Any], limits: F32, shape: Sequence[int]) -> F32:
     """A level (rows, columns, channels) of a texture from integers and range of :func:`encode`.
 
     Raises
     ------
-    KeyError, ValueError : integers are missing, or have another shape
+    ValueError : the integers have another shape
     """
-    code, rows, columns = codes[""], *shape[:2]
     if code.ndim == 4:
+        rows, columns, _ = shape
         if code.shape[:2] != (-(-rows // BLOCK), -(-columns // BLOCK)) or code.shape[3] != 8:
             raise ValueError(f"has blocks of the shape {code.shape}")
         share = decode_blocks(code, rows, columns) / (255 * STEPS)
     else:
         share = code / np.iinfo(code.dtype).max
-    if PRECISE in codes:
-        share = np.concatenate([codes[PRECISE] / 255, share], -1)
     if share.shape != tuple(shape):
         raise ValueError(f"has the shape {share.shape} in place of {tuple(shape)}")
     low, high = limits.astype(np.float64)

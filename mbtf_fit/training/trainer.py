@@ -300,13 +300,11 @@ class Trainer:
             return self._stepper.step(self.loss, batch, sigmas, workers)
         texels, weights = self.hooks.trained()
         # Lookups read detached tables; their gradients pass through the blur once, for the whole batch.
-        tables = self._tables() if texels else []
-        tables = [
-            table if texture.rounding is None else table + texture.rounding
-            for texture, table in zip(self.model.textures(), tables, strict=False)
-        ]
+        textures, blurred = (self.model.textures(), self._tables()) if texels else ([], [])
+        both = zip(textures, blurred, strict=True)
+        tables = [table if t.rounding is None else table + t.rounding for t, table in both]
         leaves = [t.detach().requires_grad_() for t in tables]
-        for texture, leaf in zip(self.model.textures() if texels else [], leaves, strict=True):
+        for texture, leaf in zip(textures, leaves, strict=True):
             texture.read(leaf)
         loss, gradients = workers.gradients(self._loss, batch, [*leaves, *weights])
         by_table, by_weight = gradients[: len(leaves)], gradients[len(leaves) :]
