@@ -170,8 +170,8 @@ class TrainingSection(Settings):
         32,
         ge=1,
         le=256,
-        description="image layout: largest side of the patches in a batch, in texels; smaller patches show "
-        "more lights and views, at a larger margin per texel",
+        description="image layout: largest side of a batch's patches in texels; smaller ones show more lights "
+        "and views, at a larger margin",
     )
     losses: tuple[LossTerm, ...] = Field(
         (LossTerm(kind="relative", weight=1.0), LossTerm(kind="chroma", weight=3.0)),
@@ -209,8 +209,8 @@ class TrainingSection(Settings):
     )
     texture_format: Annotated[TrainedFormat, Flag("--texture-format", rare=True)] = Field(
         "float32",
-        description="format of the material's textures, to which training adapts: 32 bits, 8 bits, or 4 "
-        "bits in blocks that graphics hardware reads",
+        description="format of the textures, to which training adapts: 32 bits, 8 bits, or 4 bits in blocks "
+        "for graphics hardware",
     )
     warmup: int = Field(
         100,
