@@ -170,8 +170,8 @@ class TrainingSection(Settings):
         32,
         ge=1,
         le=256,
-        description="image layout: largest side of a batch's patches in texels; smaller ones show more lights "
-        "and views, at a larger margin",
+        description="image layout: largest side of a batch's patches in texels; smaller ones show more "
+        "lights and views, at a larger margin",
     )
     losses: tuple[LossTerm, ...] = Field(
         (LossTerm(kind="relative", weight=1.0), LossTerm(kind="chroma", weight=3.0)),

@@ -187,8 +187,8 @@ class QueriesSection(Settings):
         None,
         ge=0,
         le=0.95,
-        description="share of test queries drawn by the highlights, and weighted; default: 75% if a pilot shows "
-        "that it pays, else 0",
+        description="share of test queries drawn by the highlights, and weighted; default: 75% if a pilot "
+        "shows that it pays, else 0",
     )
     lights_per_path: Annotated[int, Flag("--lights-per-path", rare=True)] = Field(
         1,

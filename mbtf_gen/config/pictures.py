@@ -55,8 +55,8 @@ TilesAcross = Annotated[
 PATHS_PER_PIXEL = "paths per pixel"
 Exposure = Annotated[Annotated[float, Field(ge=-40, le=40)] | Literal["auto"], Flag("--exposure", "EV|auto")]
 EXPOSURE = (
-    "exposure of the pictures: v in 1/sr is shown as 2^EV v. 1.65 shows a white diffuse surface as white; auto, "
-    "the 95th percentile of the pictures as 0.8"
+    "exposure of the pictures: v in 1/sr is shown as 2^EV v. 1.65 shows a white diffuse surface as white; "
+    "auto, the 95th percentile of the pictures as 0.8"
 )
 # Sections of the generator's configuration that decide what a picture shows.
 RENDERING = ("geometry", "light", "transport", "effects", "seed")
