@@ -6,7 +6,7 @@
 ``speed``: ``neumip`` with a pyramid of 256² and batches of 2^16, in three ways that take turns:
 
 - **plain**: as one writes it down (class ``Plain``): one tensor per level, blurred by FFT while the blur is
-  annealed, texels by indexing or ``grid_sample``, whichever is faster, ``torch.nn.Linear``, autograd, Adam;
+  annealed, ``grid_sample``, ``torch.nn.Linear``, autograd, Adam;
 - **pytorch**: the fitter without the compiled kernel;
 - **kernel**: the compiled kernel, where it is there.
 
@@ -23,10 +23,8 @@ from __future__ import annotations
 import argparse
 import os
 import statistics
-import sys
 import time
 from collections import defaultdict
-from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -68,21 +66,9 @@ MOMENTS = [0.05 + 0.1 * k for k in range(10)]
 STEPS = 10_000
 
 
-def by_index(texture: Tensor, u: Tensor) -> Tensor:
-    """Bilinear lookup in a periodic texture (rows, columns, channels) at u (n, 2), texel by texel."""
-    rows, columns, _ = texture.shape
-    x, y = u[:, 0] * columns - 0.5, (1 - u[:, 1]) * rows - 0.5
-    i, j = x.floor(), y.floor()
-    fx, fy = (x - i)[:, None], (y - j)[:, None]
-    left, top = i.long() % columns, j.long() % rows
-    right, bottom = (left + 1) % columns, (top + 1) % rows
-    upper = (1 - fx) * texture[top, left] + fx * texture[top, right]
-    lower = (1 - fx) * texture[bottom, left] + fx * texture[bottom, right]
-    return (1 - fy) * upper + fy * lower
-
-
-def by_grid_sample(texture: Tensor, u: Tensor) -> Tensor:
-    """The same by PyTorch's own function, which does not wrap: one texel more on every side does."""
+def bilinear(texture: Tensor, u: Tensor) -> Tensor:
+    """Lookup in a periodic texture (rows, columns, channels) at u (n, 2). PyTorch's function, faster than
+    indexing, does not wrap: one texel more on every side does."""
     rows, columns, channels = texture.shape
     image = nn.functional.pad(texture.permute(2, 0, 1)[None], (1, 1, 1, 1), mode="circular")
     at = u - u.floor()
@@ -112,22 +98,15 @@ def network(inputs: int, outputs: int) -> nn.Sequential:
 
 
 class Plain(nn.Module):
-    """``neumip`` as plain PyTorch.
+    """``neumip`` as plain PyTorch."""
 
-    Parameters
-    ----------
-    read : bilinear lookup in one texture
-    """
-
-    def __init__(self, lattice: Lattice, unit: float, read: Callable[[Tensor, Tensor], Tensor]) -> None:
+    def __init__(self, lattice: Lattice, unit: float) -> None:
         super().__init__()
-        self.lattice, self.unit, self.read = lattice, unit, read
+        self.lattice, self.unit = lattice, unit
         shapes = [lattice.shape(s) for s in range(lattice.finest + 1)]
         self.pyramid = nn.ParameterList(nn.Parameter(torch.empty(*shape, 7)) for shape in shapes)
         self.offset_texture = nn.Parameter(torch.empty(*shapes[-1], 7))
         self.decoder, self.offset_network = network(11, 3), network(9, 1)
-        self.seconds: dict[str, float] = defaultdict(float)
-        self._mark = 0.0
 
     def take(self, model: NeuralMaterial) -> None:
         """Take over the weights of the fitter's model."""
@@ -141,16 +120,8 @@ class Plain(nn.Module):
                     layer.weight.copy_(weights[f"{name}.{k}.weight"])
                     layer.bias.copy_(weights[f"{name}.{k}.bias"])
 
-    def mark(self, part: str | None = None) -> None:
-        """Count the time since the last mark as a part's."""
-        now = time.perf_counter()
-        if part is not None:
-            self.seconds[part] += now - self._mark
-        self._mark = now
-
     def forward(self, q: TrainingQueries, sigma: float, offset_sigma: float) -> Tensor:
         """Values (n, 3), textures blurred by `sigma` texels of the finest level."""
-        self.mark()
         columns = self.lattice.shape()[1]
         pyramid: list[Tensor] = list(self.pyramid)
         for s, texture in enumerate(pyramid):
@@ -160,11 +131,8 @@ class Plain(nn.Module):
         offset_texture: Tensor = self.offset_texture
         if offset_sigma > 0:
             offset_texture = blur_by_fft(offset_texture, offset_sigma)
-        self.mark("blur")
-        seen = self.read(offset_texture, q.u)
-        self.mark("lookups")
+        seen = bilinear(offset_texture, q.u)
         r = 0.1 * self.offset_network(torch.cat([seen, q.omega_o[:, :2]], 1))
-        self.mark("networks")
         step = r * q.omega_o[:, :2] / q.omega_o[:, 2:].clamp_min(0.6)
         u = q.u + step / torch.tensor([1.0, self.lattice.aspect])
         level = (-torch.log2(2 * q.sigma)).clamp(0, self.lattice.finest)
@@ -172,12 +140,10 @@ class Plain(nn.Module):
         for s, texture in enumerate(pyramid):
             weight = (1 - (level - s).abs()).clamp_min(0)
             rows = weight.nonzero()[:, 0]
-            part = weight[rows, None] * self.read(texture, u[rows])
+            part = weight[rows, None] * bilinear(texture, u[rows])
             features = features.index_add(0, rows, part)
-        self.mark("lookups")
         x = self.decoder(torch.cat([features, q.omega_i[:, :2], q.omega_o[:, :2]], 1))
         value = self.unit * torch.expm1(x)
-        self.mark("networks")
         return value
 
 
@@ -220,9 +186,7 @@ class Plainly:
         loss = ((p - batch.value) ** 2 / (p.detach() ** 2 + self.unit**2)).mean()
         self.optimizer.zero_grad()
         loss.backward()
-        self.model.mark("backward")
         self.optimizer.step()
-        self.model.mark("Adam")
 
 
 class Ours:
@@ -267,17 +231,8 @@ def measure_speed(arguments: argparse.Namespace) -> int:
         model.initialize(torch.Generator().manual_seed(0), unit)
         return model
 
-    plains = {}
-    for read in (by_index, by_grid_sample):
-        plain = Plain(lattice, unit, read)
-        plain.take(fresh())
-        step = Plainly(plain, config, unit)
-        step(batches[0], 0.5)
-        plains[read.__name__] = (timed(partial(step, batches[1], 0.5)), step)
-    reader = min(plains, key=lambda name: plains[name][0])
-    plainly = plains[reader][1]
+    plainly = Plainly(Plain(lattice, unit), config, unit)
     plainly.model.take(fresh())
-    plainly.model.seconds.clear()
 
     pytorch = Ours(fresh(), config, queries, kernel=False)
     kernel = Ours(fresh(), config, queries, kernel=True)
@@ -305,15 +260,11 @@ def measure_speed(arguments: argparse.Namespace) -> int:
             step(batch, moment)
 
     for number in range((arguments.rounds or 3) + 1):
-        if number == 1:
-            plainly.model.seconds.clear()
         times = {"plain": timed(partial(all_moments, plainly))}
-        shares = dict(plainly.model.seconds)
         for way, mine in ours.items():
             with mine:
                 times[way] = timed(partial(all_moments, mine))
         evaluations = {"plain": timed(plain_inference)}
-        plainly.model.seconds = defaultdict(float, shares)
         for way in ours:
             use_kernel(way == "kernel")
             evaluations[way] = timed(lambda: predict(model, *whole))
@@ -321,10 +272,6 @@ def measure_speed(arguments: argparse.Namespace) -> int:
             for way in times:
                 training[way].append(times[way])
                 inference[way].append(evaluations[way])
-    parts = plainly.model.seconds
-    total = sum(parts.values())
-    divided = ", ".join(f"{name} {time / total:.0%}" for name, time in parts.items())
-    print(f"plain way ({reader}): {divided} of a step", file=sys.stderr)
     rates = {
         kind: {way: len(queries) / statistics.median(found) for way, found in measured.items()}
         for kind, measured in (("training", training), ("inference", inference))
@@ -344,35 +291,26 @@ def measure_speed(arguments: argparse.Namespace) -> int:
         "queries_per_second": rates,
         "ratios": ratios,
         "path": kernel.backend,
-        "plain_shares": {name: time / total for name, time in parts.items()},
-        "plain_lookup": reader,
         "threads": torch.get_num_threads(),
     }
     return finish(figures, THRESHOLDS, met)
 
 
-def queries(n: int, finest: int) -> list[torch.Tensor]:
-    """u, σ, light and view at random."""
-    random = np.random.default_rng(0)
-    sigma = 0.5 * np.exp2(-finest * random.random(n))
-    light, view = (from_projected_disk(1.2 * random.random((n, 2)) - 0.6) for _ in range(2))
-    return [torch.from_numpy(np.asarray(a, np.float32)) for a in (random.random((n, 2)), sigma, light, view)]
-
-
 def cost(name: str, finest: int, repeat: int) -> dict[str, Any]:
     """Microseconds of processor time per value, and weights."""
     model_name, network = CASES[name]
-    model = build_model(model_name, Lattice(finest), **network)
+    lattice = Lattice(finest)
+    model = build_model(model_name, lattice, **network)
     model.initialize(torch.Generator().manual_seed(0), 0.1)
     n = POSITIONS // model.positions
-    u, sigma, light, view = queries(n, finest)
+    q = random_batch(np.random.default_rng(0), n, lattice)
     first, second = [], []
     with torch.no_grad():
         for _ in range(repeat):
             start = time.process_time()
-            features = model.stage1(u, sigma, view)
+            features = model.stage1(q.u, q.sigma, q.omega_o)
             middle = time.process_time()
-            model.stage2(features, light, view)
+            model.stage2(features, q.omega_i, q.omega_o)
             first.append(middle - start)
             second.append(time.process_time() - middle)
     return {
