@@ -16,7 +16,6 @@ from mbtf_core.units import Size, format_duration, parse_duration
 OutputTransform = Literal["expm1", "exp", "identity", "softplus", "fourth-root"]
 LossKind = Literal["relative", "squared", "chroma", "linear", "log", "fourth-root", "gradient"]
 Correction = Literal["none", "linear"]
-TrainedFormat = Literal["float32", "unorm8", "bc4"]
 
 
 class EncodingSection(Settings):
@@ -206,11 +205,6 @@ class TrainingSection(Settings):
         le=1e4,
         description="strength of the weight decay and blur that follow from noise and number of the queries; "
         "0: none",
-    )
-    texture_format: Annotated[TrainedFormat, Flag("--texture-format", rare=True)] = Field(
-        "float32",
-        description="format of the textures, to which training adapts: 32 bits, 8 bits, or 4 bits in blocks "
-        "for graphics hardware",
     )
     warmup: int = Field(
         100,

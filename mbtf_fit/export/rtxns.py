@@ -72,4 +72,4 @@ def write(export: Export, options: None) -> list[str]:
     return names
 
 
-TARGET = ExportTarget("rtxns", "the networks alone, in half precision, for RTX Neural Shading", NAMES, write)
+TARGET = ExportTarget("rtxns", "the networks alone, in half precision, for RTX Neural Shading (1.3)", NAMES, write)

@@ -6,6 +6,9 @@ channel of 4 × 4 texels in 8 bytes: two end points of 8 bits, and 3 bits per te
 (Direct3D's ``BC4_UNORM``). Learned channels differ from each other. BC7, in which up to four channels share
 lines, takes half the bytes of BC4 and makes three to five times the error.
 
+Textures are rounded after training. Steps that read rounded textures, with gradients passed straight through,
+leave the same error: a ratio of 1.000 ± 0.004 over seven pairs of fits.
+
 Heights have 16 bits in both formats, as view rays are traced to them, and maps 8: highlights depend on their
 slopes and roughness, which in blocks add a tenth to the error of glossy `turtle_shell`. What has been decoded
 is encoded to the same numbers again: end points are the extremes of a block.

@@ -110,9 +110,6 @@ class FeatureTextures(nn.Module):
     Attributes
     ----------
     texels : (texels, channels) parameter, all levels one after the other
-    rounding : (texels, channels) tensor, what the rounding of stored textures has added to the blurred texels
-        when it was last computed, or None. It has no gradient (straight-through estimator: Bengio, Léonard
-        and Courville, arXiv 1308.3432, 2013).
     """
 
     def __init__(
@@ -122,7 +119,6 @@ class FeatureTextures(nn.Module):
         self.moves_lookups = moves_lookups
         self.packing = Packing.of(lattice, levels)
         self.texels = nn.Parameter(torch.zeros(self.packing.texels, channels))
-        self.rounding: Tensor | None = None
         self._table: Tensor | None = None
 
     @property
@@ -136,7 +132,7 @@ class FeatureTextures(nn.Module):
         self._table = None if table is self.texels else table
 
     def blurred(self, sigma: float) -> Tensor:
-        """The texels, blurred by a Gaussian of `sigma` texels of the finest level, without rounding.
+        """The texels, blurred by a Gaussian of `sigma` texels of the finest level.
 
         Coarser levels get the same blur in tile widths: half as many texels each (as in the published
         code).
@@ -164,11 +160,7 @@ class FeatureTextures(nn.Module):
 
     def export(self) -> dict[str, Tensor]:
         """Current table by level, ``0`` the coarsest: (rows, columns, channels) each."""
-        return self.levels_of(self.table.detach())
-
-    def levels_of(self, table: Tensor) -> dict[str, Tensor]:
-        """Copies of the levels of a table, as :meth:`export`."""
-        starts = self.packing.starts
+        starts, table = self.packing.starts, self.table.detach()
         return {
             str(s): table[starts[s] : starts[s + 1]].view(rows, columns, -1).clone()
             for s, (rows, columns) in enumerate(self.packing.shapes)

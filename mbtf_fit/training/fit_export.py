@@ -22,7 +22,7 @@ from mbtf_fit.material.transmittance import evaluate_transmittance, fit_transmit
 from mbtf_fit.training.fit_folder import configuration_digest, training_digest
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.sampler import distill
-from mbtf_fit.training.trainer import Trainer, TrainingProgress, round_surface
+from mbtf_fit.training.trainer import Trainer, TrainingProgress
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,6 @@ def export_fit(
     the training."""
     data = member.data
     name = member.folder.name
-    # Learned heights.
-    round_surface(trainer.model, config.training.texture_format)
     trainer.fill_levels(float(level_of_sigma(partition.sample.sigma.max())))
     trainer.calibrate(share["steps"], lambda fraction: announce("calibrating", fraction, name))
     errors = evaluate_splits(
@@ -126,6 +124,5 @@ def export_fit(
         training=training | share,
         transmittance=transmittance,
         sampler=sampler,
-        form=config.training.texture_format,
     )
     announce("writing", 1.0, name)

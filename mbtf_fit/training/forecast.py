@@ -16,7 +16,6 @@ from mbtf_core.stats import Estimate
 from mbtf_core.units import clock
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training
-from mbtf_fit.material.material import stored_tensors
 from mbtf_fit.models.registry import material_of
 from mbtf_fit.sections import TimeBudget
 from mbtf_fit.surface.known import surface_bytes
@@ -131,7 +130,6 @@ def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForec
     restore(loop, start, TrainingProgress())
     trainer.config = config
     subset = validation_subset(trainer.model.positions, validation_set(data, partition)[1])
-    written = stored_tensors(trainer.model.weights(), config.training.texture_format)
     return FitForecast(
         seconds=total.value,
         seconds_se=total.error,
@@ -139,6 +137,6 @@ def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForec
         closing=closing_seconds(len(partition.training)),
         steps=steps,
         queries_per_second=trainer.batch / step.value,
-        bytes=sum(tensor.nbytes for tensor in written.values()),
+        bytes=sum(tensor.nbytes for tensor in trainer.model.weights().values()),
         error=forecast_error(loop, subset, step, steps),
     )

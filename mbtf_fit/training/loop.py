@@ -215,7 +215,7 @@ def state_tensors(loop: TrainingLoop) -> dict[str, Tensor]:
             tensors[f"{k}.model.{name}"] = p.detach()
             for key, value in trainer.optimizer.state.get(p, {}).items():
                 tensors[f"{k}.adam.{key}.{name}"] = value
-        tensors |= {f"{k}.state.{name}": tensor for name, tensor in trainer.state().items()}
+        tensors |= {f"{k}.state.{name}": tensor for name, tensor in trainer.hooks.state().items()}
     return tensors
 
 
@@ -293,4 +293,4 @@ def _load(trainer: Trainer, parameters: dict[str, Tensor], tensors: dict[str, Te
         for name, p in parameters.items():
             p.copy_(tensors[f"model.{name}"])
     state = {n.removeprefix("state."): t for n, t in tensors.items() if n.startswith("state.")}
-    trainer.restore(state)
+    trainer.hooks.restore(state)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -26,8 +26,6 @@ from mbtf_fit.data.streaming import StreamedQueries
 from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.inference import predict
 from mbtf_fit.material.material import Material
-from mbtf_fit.material.rounding import round_weights
-from mbtf_fit.material.texture_formats import TextureFormat
 from mbtf_fit.models.model import Model, Preparation
 from mbtf_fit.models.registry import material_of, model_class
 from mbtf_fit.native import kernel
@@ -36,9 +34,8 @@ from mbtf_fit.objective.noise import NoiseModel, typical_value, value_bound
 from mbtf_fit.objective.parallel import MAX_KERNEL_THREADS, MAX_THREADS, Batch, Workers
 from mbtf_fit.ops import Lookup
 from mbtf_fit.pytorch.material import NeuralMaterial
-from mbtf_fit.pytorch.textures import FeatureTextures, annealed_sigma
+from mbtf_fit.pytorch.textures import annealed_sigma
 from mbtf_fit.sections import TrainingSection
-from mbtf_fit.surface.known import KnownSurface
 from mbtf_fit.training.calibration import fit_calibration
 from mbtf_fit.training.suitable_data import open_data
 
@@ -65,9 +62,6 @@ _SPATIAL_WEIGHTS, _WEIGHTS, _MOST_DECAY = 2e5, 9e3, 1.0
 # Decay of texels, and squared sigma of their blur, per noise-to-signal ratio over the number of queries per
 # texel; and the largest decay.
 _TEXELS, _BLUR, _MOST_TEXEL_DECAY = 150.0, 25.0, 50.0
-# Share of the budget after which steps see textures rounded to their stored format, and steps after which the
-# rounding is computed again, which takes as long as several steps.
-_ROUNDED, _ROUNDING_STEPS = 0.5, 32
 
 
 def learning_rate_factor(training: TrainingSection, step: int, fraction: float) -> float:
@@ -178,8 +172,6 @@ class Trainer:
         self.batch = min(config.training.batch, len(queries))
         texels, weights = self.hooks.trained()
         self.noise = noise
-        # Step of the last rounding.
-        self._rounded: int | None = None
         self.loss = Objective(config.training, noise)
         self.regularization = self.regularization_of(len(queries))
         found, groups = kernel(), [texels, weights]
@@ -196,37 +188,6 @@ class Trainer:
         them towards an arbitrary material."""
         texels = len(self.model.textures()[0].texels) if self.model.networks() else 0
         return Regularization.of(self.config.training, self.noise.ratio, queries, texels)
-
-    def round_textures(self) -> None:
-        """Let steps see what rounding to the format of stored textures adds to the textures as they are."""
-        self._rounded = self.progress.step
-        with torch.no_grad():
-            for texture, table in zip(self.model.textures(), self._tables(), strict=True):
-                texture.rounding = self._as_stored(texture, table) - table
-
-    def _as_stored(self, texture: FeatureTextures, table: Tensor) -> Tensor:
-        """The table (texels, channels) of a texture as readers of the material get it."""
-        form = self.config.training.texture_format
-        if form == "float32" or texture not in self.model.stored_textures().values():
-            return table
-        rounded = round_weights(texture.levels_of(table), form)
-        return torch.cat([rounded[str(s)].flatten(0, 1) for s in range(len(rounded))])
-
-    def state(self) -> dict[str, Tensor]:
-        """Tensors of a checkpoint, besides parameters."""
-        out = self.hooks.state() | (
-            {"rounded": torch.tensor(self._rounded)} if self._rounded is not None else {}
-        )
-        textures = enumerate(self.model.textures())
-        return out | {f"rounding.{k}": t.rounding for k, t in textures if t.rounding is not None}
-
-    def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Inverse of :meth:`state`."""
-        self._rounded = int(state["rounded"]) if "rounded" in state else None
-        for k, texture in enumerate(self.model.textures()):
-            found = state.get(f"rounding.{k}")
-            texture.rounding = None if found is None else found.to(self.device, copy=True)
-        self.hooks.restore(state)
 
     @property
     def backend(self) -> str:
@@ -290,9 +251,6 @@ class Trainer:
             for texture, sigma in zip(self.model.textures(), sigmas, strict=True)
             if module is texture
         }
-        rounds = self.config.training.texture_format != "float32" and self.fraction >= _ROUNDED
-        if rounds and (self._rounded is None or self.progress.step - self._rounded >= _ROUNDING_STEPS):
-            self.round_textures()
         batch = self.hooks.before_step(self.progress.step, self.fraction, named, batch)
         self.loss.fraction = self.fraction
         if self._stepper is not None:
@@ -300,11 +258,9 @@ class Trainer:
             return self._stepper.step(self.loss, batch, sigmas, workers)
         texels, weights = self.hooks.trained()
         # Lookups read detached tables; their gradients pass through the blur once, for the whole batch.
-        textures, blurred = (self.model.textures(), self._tables()) if texels else ([], [])
-        both = zip(textures, blurred, strict=True)
-        tables = [table if t.rounding is None else table + t.rounding for t, table in both]
+        tables = self._tables() if texels else []
         leaves = [t.detach().requires_grad_() for t in tables]
-        for texture, leaf in zip(textures, leaves, strict=True):
+        for texture, leaf in zip(self.model.textures() if texels else [], leaves, strict=True):
             texture.read(leaf)
         loss, gradients = workers.gradients(self._loss, batch, [*leaves, *weights])
         by_table, by_weight = gradients[: len(leaves)], gradients[len(leaves) :]
@@ -320,18 +276,17 @@ class Trainer:
         return loss
 
     def predict(self, queries: ShardQueries) -> NDArray[np.float32]:
-        """Values (n, 3) of the current model with the current blur, of textures as a material stores them."""
+        """Values (n, 3) of the current model with the current blur."""
         self._read_blurred()
         return predict(self.model, queries.u, queries.sigma, queries.omega_i, queries.omega_o)
 
     def _read_blurred(self) -> None:
-        """Let lookups read the textures with the current blur, or those that the encoder writes, rounded to
-        the format of stored textures."""
-        written = self.hooks.write_textures(self.queries)
+        """Let lookups read the textures with the current blur, or those that the encoder writes."""
+        if self.hooks.write_textures(self.queries):
+            return
         with torch.no_grad():
-            tables = [t.table for t in self.model.textures()] if written else self._tables()
-            for texture, table in zip(self.model.textures(), tables, strict=True):
-                texture.read(self._as_stored(texture, table))
+            for texture, table in zip(self.model.textures(), self._tables(), strict=True):
+                texture.read(table)
 
     @property
     def calibrates(self) -> bool:
@@ -414,15 +369,7 @@ def prepare_trainer(
     model = model.to(device)
     if shared is not None:
         model.share_networks(shared)
-    # Before hints are computed.
-    round_surface(model, config.training.texture_format)
     return Trainer(config, model, training, noise, hooks)
-
-
-def round_surface(model: NeuralMaterial, form: TextureFormat) -> None:
-    """Let rays and hints see the surface as readers of a format get it."""
-    if model.surface is not None and form != "float32":
-        model.know(KnownSurface.from_tensors(round_weights(model.surface.tensors(), form), model.lattice))
 
 
 def _initialize_from(hooks: Model, folder: str | Path) -> None:

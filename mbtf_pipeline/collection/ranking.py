@@ -15,14 +15,16 @@ from typing import Any
 
 from mbtf_core.errors import MbtfError
 from mbtf_core.files.atomic import data_sha256, read_json
-from mbtf_core.stats import Estimate
+from mbtf_core.stats import Estimate, t_test
 from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun, ratio_of
 from mbtf_pipeline.collection.recipes import Published, first_known, seedless
 from mbtf_pipeline.stages import SHARDS
-from mbtf_pipeline.tables import Cell, Column, Table, estimate, is_significant, rows_of
+from mbtf_pipeline.tables import Cell, Column, Table, estimate, rows_of
 
 # Beside the runs: SUBMISSIONS/METHOD/RUN.npz with predictions of foreign code; runs are named for materials.
 SUBMISSIONS = "submissions"
+# Level of tests of significance.
+LEVEL = 0.05
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,8 @@ def _over_seeds(records: Sequence[Any]) -> Estimate | None:
         return None
     seeds = stdev(e.value for e in found) / math.sqrt(len(found)) if len(found) > 1 else 0.0
     noise = fmean(e.error for e in found)
-    return Estimate(fmean(e.value for e in found), math.hypot(seeds, noise), found[0].n)
+    dof = len(found) - 1 or None
+    return Estimate(fmean(e.value for e in found), math.hypot(seeds, noise), found[0].n, dof)
 
 
 def _inside(errors: Any, *keys: str) -> Any:
@@ -149,12 +152,14 @@ def _ratio(entry: Entry, first: Entry | None) -> Estimate | None:
 
 
 def _significance(entry: Entry, first: Entry | None) -> str | None:
-    """Whether the error differs from that of the first method. Its standard error counts the noise of the
-    queries that both share twice, and is therefore rather too large."""
-    ratio = _ratio(entry, first)
-    if entry is first or ratio is None or not math.isfinite(ratio.value):
+    """Whether the error differs from that of the first method, by a t-test at 5% that counts the noise of the
+    queries that both share twice. A single seed does not tell."""
+    if first is None or entry is first or min(len(entry.errors), len(first.errors)) < 2:
         return None
-    return "yes" if is_significant(Estimate(ratio.value - 1.0, ratio.error, ratio.n)) else "no"
+    mine, other = entry.error(), first.error()
+    if mine is None or other is None:
+        return None
+    return "yes" if t_test(mine, other).p_value < LEVEL else "no"
 
 
 def _with_published(published: Sequence[Published]) -> list[Column]:
@@ -175,9 +180,11 @@ def _with_published(published: Sequence[Published]) -> list[Column]:
     ]
 
 
-def _digest(run: FinishedRun) -> str:
-    """First digits of the SHA-256 over those of all shards."""
+def _digest(run: FinishedRun) -> str | None:
+    """First digits of the SHA-256 over those of all shards; None where they are gone."""
     sidecars = sorted((run.folder / SHARDS).glob("*-?????.json"))
+    if not sidecars:
+        return None
     return data_sha256([read_json(file)["sha256"] for file in sidecars])[:16]
 
 

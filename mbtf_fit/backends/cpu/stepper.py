@@ -126,13 +126,11 @@ class NativeStepper:
         textures = self._native.textures
         blurs = [Blur(self.kernel, t, sigma) for t, sigma in zip(textures, sigmas, strict=True)]
         for texture, blur, between, table in zip(textures, blurs, self._between, self._tables, strict=True):
-            read: Tensor = texture.texels
-            if not blur.idle:
+            if blur.idle:
+                texture.read(texture.texels)
+            else:
                 blur.apply(texture.texels.detach(), between, table, workers)
-                read = table
-            if texture.rounding is not None:
-                read = torch.add(read.detach(), texture.rounding, out=table)
-            texture.read(read)
+                texture.read(table)
         loss = self._gradients.compute(objective, batch, workers)
         found: dict[Tensor, Tensor] = {}
         for k, (texture, blur) in enumerate(zip(textures, blurs, strict=True)):

@@ -26,7 +26,7 @@ from mbtf_pipeline.recipe import (
     read_resolved,
     write_recipe,
 )
-from mbtf_pipeline.run import _material_inputs, _RecipeRun, survey
+from mbtf_pipeline.run import _material_inputs, _RecipeRun, data_sets, survey
 from mbtf_pipeline.stages import run_stages
 
 HEAD = """\
@@ -245,3 +245,14 @@ def test_a_preset_sets_the_resolution_unless_told(tmp_path: Path) -> None:
     assert found == [128, 256, 256, None]
     told = preset_recipe(path, "draft", ["generate.queries.resolution=512"])
     assert told.generate.queries.resolution == 512
+
+
+@pytest.mark.parametrize(("layout", "found"), [("slices", ["slices"]), ("shuffled", ["shuffled", "slices"])])
+def test_models_of_queries_are_trained_on_slices_where_these_are_the_data(
+    layout: str, found: list[str], tmp_path: Path
+) -> None:
+    file = tmp_path / "recipe.yaml"
+    text = f"name: x\ngenerate: {{material: maps/, queries: {{layout: {layout}, train: 196/texel}}}}\n"
+    (tmp_path / "maps").mkdir()
+    file.write_text(text + "fit: {neumip: {}, rainer2019: {}}\n")
+    assert [data.config.queries.layout for data in data_sets(load_recipe(file))] == found

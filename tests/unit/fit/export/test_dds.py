@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import struct
 from pathlib import Path
 
 import imagecodecs
@@ -62,6 +63,31 @@ def test_hardware_textures_are_those_of_the_material(tmp_path: Path) -> None:
     (low,), (high,) = ranges["surface.heights"]
     expected = weights["surface.heights"].numpy().ravel()
     np.testing.assert_allclose(low + (high - low) * heights / 65535, expected, atol=1e-7)
+
+
+def test_headers_are_those_of_direct3d(tmp_path: Path) -> None:
+    """Size, mip levels, capabilities, format and slices, of a tile that is half as high as wide; slices lie
+    one after the other, each with its mip levels."""
+    write_material(tmp_path / "m", model="relief", finest=3, aspect=0.5)
+    line = ["export", str(tmp_path / "m"), "--texture-format", "bc4", "-q", "--to", "dds", "--to", "material"]
+    assert run(app, [*line, "-o", str(tmp_path / "out")]) == 0
+    weights = Material.load(tmp_path / "out").model.weights()
+    # DXGI_FORMAT_BC5_UNORM, _R8G8_UNORM, _R16_UNORM.
+    for name, form, pair in (("pyramid", 83, 2), ("surface.maps", 49, 2), ("surface.heights", 56, 1)):
+        data = (tmp_path / "out" / f"{name}.dds").read_bytes()
+        levels = [weights[f"{name}.{s}"] for s in range(9) if f"{name}.{s}" in weights] or [weights[name]]
+        rows, columns, channels = np.atleast_3d(levels[-1].numpy()).shape
+        assert struct.unpack_from("<4s7I", data) == (b"DDS ", 124, 0x21007, rows, columns, 0, 0, len(levels))
+        assert struct.unpack_from("<2I4s", data, 76) == (32, 4, b"DX10")
+        assert struct.unpack_from("<I", data, 108) == (0x401008,)
+        # A two-dimensional texture.
+        assert struct.unpack_from("<5I", data, 128) == (form, 3, 0, channels // pair, 0)
+        if name == "surface.maps":
+            low, high = np.array(json.loads((tmp_path / "out" / "layers.json").read_text())["ranges"][name])
+            start = HEADER_BYTES + 2 * sum(x.shape[0] * x.shape[1] for x in levels)
+            second = np.frombuffer(data, np.uint8, 2 * rows * columns, start).reshape(rows, columns, 2)
+            expected = (levels[-1].numpy() - low) / np.where(high > low, high - low, 1)
+            np.testing.assert_allclose(second / 255, expected[..., 2:4], atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -11,18 +11,11 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from safetensors.numpy import load_file
-from support.fit_data import parallax, write_data
-from support.killed_fits import run_killed
-from support.known_surfaces import geometry, rough_heights
 from support.plugin_materials import replace_tensors, write_material
 
-import mbtf_fit.training.fit
-from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
-from mbtf_fit import FitConfig, Material, fit
+from mbtf_fit import Material
 from mbtf_fit.backends.mitsuba.stored_material import read_material
-from mbtf_fit.data.loader import load_training
 from mbtf_fit.material.material import export
 from mbtf_fit.material.numpy_reader import NumpyMaterial
 from mbtf_fit.material.rounding import round_material
@@ -33,9 +26,7 @@ from mbtf_fit.material.texture_formats import (
     encode_blocks,
     round_levels,
 )
-from mbtf_fit.native import library
 from mbtf_fit.ops.constants import HEIGHTS
-from mbtf_fit.training.trainer import Trainer, prepare_trainer
 
 SHAPES = [(1, 1), (2, 2), (3, 5), (8, 8), (24, 32)]
 
@@ -119,72 +110,3 @@ def test_damaged_blocks_are_refused(tmp_path: Path) -> None:
         replace_tensors(tmp_path, change)
         with pytest.raises(InputError, match=r"quantized texture 'pyramid\.\d' cannot be decoded"):
             Material.load(tmp_path)
-
-
-@pytest.fixture(scope="module")
-def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    rough = geometry(Lattice(3), rough_heights(16, 16), roughness=0.4, metallic=0.7, seed=0)
-    folder = tmp_path_factory.mktemp("data") / "shards"
-    return write_data(folder, parallax, train=3000, test=500, noise=0.01, geometry=rough)
-
-
-def config(form: str, steps: int, **training: Any) -> FitConfig:
-    options = {"steps": steps, "batch": 300, "warmup": 3, "texture_format": form, **training}
-    return FitConfig.model_validate({"training": options})
-
-
-def trainer_of(shards: Path, form: str) -> Trainer:
-    chosen = config(form, 10)
-    data = Dataset.open(shards)
-    partition = load_training(data, chosen.held_out, chosen.seed)
-    return prepare_trainer(chosen, data, partition, torch.device("cpu"))
-
-
-@pytest.mark.parametrize("kernel", [True, False], ids=["kernel", "pytorch"])
-def test_gradients_at_rounded_textures_pass_to_the_texels(
-    shards: Path, kernel: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A step with a rounding is that of texels that have it already: without blur and first in Adam, whose
-    first step is the sign of the gradient."""
-    if not kernel:
-        monkeypatch.setenv(library.ENVIRONMENT, "off")
-        library.reload()
-    moved = []
-    for shifted in (False, True):
-        trainer = trainer_of(shards, "float32")
-        monkeypatch.setattr(trainer, "_sigmas", lambda: [0.0])
-        monkeypatch.setattr(type(trainer.regularization), "decay", lambda *_: None)
-        (texture,) = trainer.model.textures()
-        delta = 0.3 * torch.randn(texture.texels.shape, generator=torch.Generator().manual_seed(1))
-        if shifted:
-            texture.texels.data += delta
-        else:
-            texture.rounding = delta
-        before = texture.texels.detach().clone()
-        with mbtf_fit.training.loop.Workers(trainer.device) as workers:
-            next(trainer.steps(workers, 0))
-        moved.append(texture.texels.detach() - before)
-    assert moved[0].abs().max() > 1e-4
-    np.testing.assert_allclose(moved[0], moved[1], atol=2e-6)
-    monkeypatch.undo()
-    library.reload()
-
-
-def test_a_fit_with_blocks_is_killed_and_resumed(
-    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its error is near that of single precision, and its material holds what training has seen last."""
-    whole = fit(config("bc4", 60), shards, tmp_path / "bc4")
-    exact = fit(config("float32", 60), shards, tmp_path / "float32")
-    mine, other = (r.errors["test"]["unexplained"]["value"] for r in (whole, exact))
-    assert mine < 1.2 * other
-    sizes = [(tmp_path / n / "weights.safetensors").stat().st_size for n in ("bc4", "float32")]
-    assert sizes[0] < 0.6 * sizes[1]
-    assert whole.material.deviation() < 1e-5 * whole.material.conformance["rgb"].max()
-    monkeypatch.setattr(mbtf_fit.training.fit, "_REPORT_SECONDS", 0.0)
-    monkeypatch.setattr(mbtf_fit.training.fit, "_CHECKPOINT_SECONDS", 0.0)
-    # Kills are at random steps of ten, the last five of which see blocks.
-    straight = fit(config("bc4", 10), shards, tmp_path / "straight")
-    found, _ = run_killed(monkeypatch, lambda: fit(config("bc4", 10), shards, tmp_path / "killed"))
-    weights = straight.material.model.weights()
-    assert all(torch.equal(t, weights[name]) for name, t in found.material.model.weights().items())

@@ -298,3 +298,18 @@ def test_hierarchical_sees_nine_by_nine_texels_of_the_nearest_level() -> None:
         torch.testing.assert_close(places[4, 4], u[0])
         torch.testing.assert_close(places[4, 5] - places[4, 4], torch.tensor([1 / columns, 0.0], dtype=F64))
         torch.testing.assert_close(places[5, 4] - places[4, 4], torch.tensor([0.0, -1 / rows], dtype=F64))
+
+
+def test_quartesan_reads_the_level_of_the_query_and_three_coarser_ones() -> None:
+    """(Q1) Levels below the coarsest are the coarsest."""
+    model = random_model("four levels")
+    texture = model.textures()[0]
+    starts = texture.packing.starts
+    for s in range(4):
+        texture.texels.data[starts[s] : starts[s + 1]] = float(s)
+    texture.read(texture.texels.detach())
+    u, view = torch.rand(2, 2, dtype=F64), directions(2)
+    found = model.stage1(u, 0.5 * 2.0 ** -torch.tensor([2.5, 3.0], dtype=F64), view)
+    expected = torch.tensor([[2.5, 3.0], [1.5, 2.0], [0.5, 1.0], [0.0, 0.0]], dtype=F64)
+    for k, levels in enumerate(expected):
+        torch.testing.assert_close(found[f"features_{k}"], levels[:, None].expand(2, 4))

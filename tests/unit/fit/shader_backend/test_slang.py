@@ -227,6 +227,7 @@ def test_other_languages(
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     assert len(before) == 3 + len(targets)
     marks = MARKS | ({".hlsl": b"linalg_MulAdd", ".spv": COOPERATIVE_VECTOR} if more else {})
+    assert (b"#define HALF_TEXELS" in before["material.slang"]) == bool(more)
     for name, text in before.items():
         assert marks.get(Path(name).suffix, b"") in text, name
     if shutil.which("g++"):
