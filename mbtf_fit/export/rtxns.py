@@ -1,4 +1,4 @@
-"""A material's networks for RTX Neural Shading, a file each.
+"""A material's networks for RTX Neural Shading (1.3 and later), a file each.
 
 Its ``HostNetwork::InitialiseFromJson`` reads ``layers``, each of ``num_inputs``, ``num_outputs``, ``weights``
 (row by row, a row per output) and ``biases``, and rounds them to half precision. It ignores other keys: here
@@ -72,4 +72,4 @@ def write(export: Export, options: None) -> list[str]:
     return names
 
 
-TARGET = ExportTarget("rtxns", "the networks alone, in half precision, for RTX Neural Shading (1.3)", NAMES, write)
+TARGET = ExportTarget("rtxns", "the networks alone, in half precision, for RTX Neural Shading", NAMES, write)
