@@ -23,7 +23,7 @@ from mbtf_fit.export import Export, ExportTarget
 from mbtf_fit.export.checks import check_stored
 from mbtf_fit.export.json import LAYERS_NAME
 from mbtf_fit.export.json import write as write_layers
-from mbtf_fit.material.texture_formats import QUANTIZED, decode, encode, grouped
+from mbtf_fit.material.texture_formats import BLOCK, QUANTIZED, TextureFormat, decode, encode, grouped
 from mbtf_fit.ops.constants import HEIGHTS, HORIZONS, MAPS
 
 _TEXTURES = ("pyramid", "offset_texture", "features", MAPS, HORIZONS, HEIGHTS)
@@ -68,7 +68,12 @@ def read_dds(data: bytes, like: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
     return out
 
 
-def _check_mips(name: str, shapes: Sequence[tuple[int, ...]]) -> None:
+def _check(name: str, shapes: Sequence[tuple[int, ...]], form: TextureFormat) -> None:
+    if name not in _TEXTURES:
+        raise InputError(f"has no place for the texture '{name}'", where="--to dds")
+    if form == "bc4" and (shapes[-1][0] % BLOCK or shapes[-1][1] % BLOCK):
+        what = f"hardware needs multiples of 4 texels, and '{name}' has {shapes[-1][0]} x {shapes[-1][1]}"
+        raise InputError(what, where="--to dds", hint="export with --texture-format unorm8")
     for (r, c, *_), (rows, columns, *_) in pairwise(shapes):
         if (r, c) != (max(rows // 2, 1), max(columns // 2, 1)):
             raise InputError(
@@ -84,14 +89,14 @@ def write(export: Export, options: None) -> list[str]:
         hint = "add --texture-format bc4, or unorm8"
         raise UsageError(f"has no textures in {export.form}", where="--to dds", hint=hint)
     weights = export.material.model.weights()
+    textures = grouped(weights)
+    for texture, names in textures.items():
+        _check(texture, [tuple(weights[name].shape) for name in names], export.form)
     files = write_layers(export, None)
     layers = json.loads((export.folder / LAYERS_NAME).read_text(encoding="utf-8"))
     read: dict[str, Any] = {}
-    for texture, names in grouped(weights).items():
-        if texture not in _TEXTURES:
-            raise InputError(f"has no place for the texture '{texture}'", where="--to dds")
+    for texture, names in textures.items():
         levels = [weights[name].cpu().numpy() for name in names]
-        _check_mips(texture, [x.shape for x in levels])
         codes, limits = encode(texture, levels, export.form)
         path = export.folder / f"{texture}.dds"
         write_chunks(path, dds_chunks(codes, levels[-1].shape[:2]))

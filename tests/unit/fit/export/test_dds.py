@@ -92,7 +92,11 @@ def test_headers_are_those_of_direct3d(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("form", "aspect", "fault"),
-    [("float32", 1.0, "no textures in float32"), ("bc4", 0.75, "are no mip levels")],
+    [
+        ("float32", 1.0, "no textures in float32"),
+        ("unorm8", 0.75, "are no mip levels"),
+        ("bc4", 0.75, "multiples of 4"),
+    ],
 )
 def test_what_hardware_cannot_read_is_refused(
     form: TextureFormat, aspect: float, fault: str, tmp_path: Path
@@ -100,3 +104,4 @@ def test_what_hardware_cannot_read_is_refused(
     material = write_material(tmp_path, aspect=aspect)
     with pytest.raises((InputError, UsageError), match=fault):
         targets()["dds"].write(Export(tmp_path, tmp_path, material, form, False, CONSOLE), None)
+    assert not (tmp_path / "layers.json").exists()

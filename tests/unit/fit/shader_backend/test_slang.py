@@ -63,6 +63,10 @@ def test_half_precision(case: str, half: bool, cooperative: bool, tmp_path: Path
         material, _ = round_material(material, "float16")
     module, content = module_of(material, half=half)
     assert (len(content) < 0.7 * size) == half
+    # Networks that move lookups stay in single precision.
+    layers = [n for n, t in material.model.weights().items() if n.endswith(".weight") and t.ndim == 2]
+    cooperating = [name for name in layers if not name.startswith("offset_network")]
+    assert len(re.findall(r"layer<\d+>\(", module)) == len(cooperating) > 0
     # HLSL's alignment of matrices.
     places = [int(n) for pair in re.findall(r"layer<\d+>\(\w+, (\d+), (\d+)\)", module) for n in pair]
     places += [int(n) for n in re.findall(r"#define MATRICES (\d+)", module)]
