@@ -45,7 +45,7 @@ def write(folder: Path, *last: Operation) -> Path:
 
 
 def command(material: Path, out: Path, name: str) -> int:
-    options = ["--texture-format", "bc4"] if name == "dds" else []
+    options = ["--texture-format", "unorm8"] if name == "dds" else []
     return run(app, ["export", str(material), "--to", name, "-o", str(out), *options])
 
 
@@ -87,7 +87,8 @@ def test_an_operation_that_readers_lack_is_refused(
         assert code == 0
         return
     assert code == 3
-    assert "does not support the operation 'ripple'" in error
+    lacks = "no place for the texture" if name == "dds" else "does not support the operation 'ripple'"
+    assert lacks in error
     assert "Traceback" not in error
     assert not {path.name for path in (tmp_path / "out").glob("*")} & set(targets()[name].files)
 
