@@ -44,8 +44,9 @@ from mbtf_pipeline.recipe import load_recipe
 RESOLUTION = 128
 # Paths per test query, and the share of these that highlights draw.
 TEST_SPP, HIGHLIGHTS = 256, 0.75
-# Training time in which a rate is measured, and how often.
-RATE_TIME, RATE_TURNS = "5s", 3
+# Training time in which a rate is measured, and how often. The first steps of ``neumip+``, which trace its
+# heights, take seconds.
+RATE_TIME, RATE_TURNS = "20s", 3
 NEUMIP: dict[str, Any] = {
     "model": "neumip",
     "network": {"width": 40, "channels": 12, "encoding": {"direction_xyz": True}},
