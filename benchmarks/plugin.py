@@ -27,7 +27,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 # Before drjit is imported: kernels are compiled anew.
 _CACHE = tempfile.TemporaryDirectory(prefix="mbtf-kernels-")
@@ -102,7 +102,7 @@ def compare_formats(material: Any, shards: Path, plugin: Any, runs: int) -> dict
     from mbtf_fit.data.loader import load_split
     from mbtf_fit.material.material import export
     from mbtf_fit.material.rounding import round_material
-    from mbtf_fit.material.texture_formats import TEXTURE_FORMATS
+    from mbtf_fit.material.texture_formats import TextureFormat
 
     def fastest(way: Callable[[], Any]) -> float:
         """A busy machine takes longer, but hardly more of its processors."""
@@ -118,7 +118,7 @@ def compare_formats(material: Any, shards: Path, plugin: Any, runs: int) -> dict
 
     rows = dict[str, dict[str, float]]()
     queries = load_split(Dataset.open(shards), "test")
-    for form in TEXTURE_FORMATS:
+    for form in get_args(TextureFormat):
         folder = Path(_CACHE.name) / form
         folder.mkdir()
         made, _ = round_material(material, form)

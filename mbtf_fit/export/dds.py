@@ -34,11 +34,16 @@ _FORMATS = {(1, 1): 61, (1, 2): 49, (2, 1): 56, (8, 1): 80, (8, 2): 83}
 HEADER_BYTES = 148
 
 
+def _together(channels: int) -> int:
+    """Channels of a slice."""
+    return 2 if channels % 2 == 0 else 1
+
+
 def dds_chunks(codes: Sequence[NDArray[Any]], shape: Sequence[int]) -> list[bytes]:
     """A DDS file of a texture's integers by level, coarsest first, whose finest level has some rows and
     columns (:func:`~mbtf_fit.material.texture_formats.encode`)."""
     channels = codes[0].shape[2]
-    pair = 2 if channels % 2 == 0 else 1
+    pair = _together(channels)
     # (rows, columns, channels, bytes), finest first.
     levels = [c if c.ndim == 4 else c[..., None].view(np.uint8) for c in reversed(codes)]
     size = levels[0].shape[3]
@@ -57,7 +62,7 @@ def dds_chunks(codes: Sequence[NDArray[Any]], shape: Sequence[int]) -> list[byte
 def read_dds(data: bytes, like: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
     """Inverse of :func:`dds_chunks`, for integers of the shapes and types of `like`."""
     channels = like[0].shape[2]
-    pair = 2 if channels % 2 == 0 else 1
+    pair = _together(channels)
     out, start = [np.empty_like(c) for c in like], HEADER_BYTES
     for first in range(0, channels, pair):
         for level in reversed(out):

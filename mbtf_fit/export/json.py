@@ -9,7 +9,7 @@ import numpy as np
 
 from mbtf_core.files.atomic import write_text
 from mbtf_fit.export import Export, ExportTarget
-from mbtf_fit.material.texture_formats import RANGE
+from mbtf_fit.material.texture_formats import QUANTIZED, grouped, range_of
 
 LAYERS_NAME = "layers.json"
 _SCHEMA = 6
@@ -26,13 +26,16 @@ def write(export: Export, options: None) -> list[str]:
     ranges of quantized textures, and the conformance queries with their expected values, that of the
     transmittance included."""
     from mbtf_fit.export.checks import check_stored
-    from mbtf_fit.material.material import describe_model, stored_tensors
+    from mbtf_fit.material.material import describe_model
     from mbtf_fit.material.transmittance import FORMULA
 
     material = export.material
     weights, expected = material.model.weights(), dict(material.conformance)
-    stored, through = stored_tensors(weights, export.form), material.transmittance
-    ranges = {n.removesuffix(RANGE): _numbers(t) for n, t in stored.items() if n.endswith(RANGE)}
+    through, textures = material.transmittance, grouped(weights) if export.form in QUANTIZED else {}
+    ranges = {
+        texture: _numbers(range_of([weights[name].cpu().numpy() for name in names]))
+        for texture, names in textures.items()
+    }
     if through is not None:
         expected["transmittance"] = through.evaluate(*(expected[k] for k in ("u", "sigma", "omega_o")))
     document = {
@@ -52,8 +55,8 @@ def write(export: Export, options: None) -> list[str]:
     path = export.folder / LAYERS_NAME
     write_text(path, json.dumps(document, indent=1))
     written = json.loads(path.read_text(encoding="utf-8"))
-    textures = {name: weights[name].cpu().numpy() for name in written["textures"]}
-    check_stored(written, written["tensors"] | textures, material, path)
+    texels = {name: weights[name].cpu().numpy() for name in written["textures"]}
+    check_stored(written, written["tensors"] | texels, material, path)
     return [LAYERS_NAME]
 
 

@@ -17,7 +17,7 @@ is encoded to the same numbers again: end points are the extremes of a block.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 from mbtf_fit.ops.constants import HEIGHTS, MAPS
 
 TextureFormat = Literal["float32", "float16", "unorm8", "bc4"]
-TEXTURE_FORMATS: tuple[TextureFormat, ...] = get_args(TextureFormat)
 # Those with a range.
 QUANTIZED: tuple[TextureFormat, ...] = ("unorm8", "bc4")
 # Texels along a side of a block, and steps between its end points.
@@ -74,6 +73,11 @@ def decode_blocks(blocks: U8, rows: int, columns: int) -> NDArray[np.int64]:
     return whole[:rows, :columns]
 
 
+def range_of(levels: Sequence[F32]) -> F32:
+    """Smallest and largest numbers (2, channels) of a texture's levels (rows, columns, channels)."""
+    return np.stack([np.min([x.min((0, 1)) for x in levels], 0), np.max([x.max((0, 1)) for x in levels], 0)])
+
+
 def encode(name: str, levels: Sequence[F32], form: TextureFormat) -> tuple[list[NDArray[Any]], F32]:
     """A texture in a format of :data:`QUANTIZED`.
 
@@ -88,8 +92,8 @@ def encode(name: str, levels: Sequence[F32], form: TextureFormat) -> tuple[list[
     (list of array, (2, channels) array)
         Integers of each level, and the channels' range: low, then high.
     """
-    limits = np.stack([[x.min((0, 1)) for x in levels], [x.max((0, 1)) for x in levels]])
-    low, high = limits[0].min(0).astype(np.float64), limits[1].max(0).astype(np.float64)
+    limits = range_of(levels)
+    low, high = limits.astype(np.float64)
     scale = 1.0 / np.where(high > low, high - low, 1.0)
     shares = [(x - low) * scale for x in levels]
     if name == HEIGHTS:
@@ -98,7 +102,7 @@ def encode(name: str, levels: Sequence[F32], form: TextureFormat) -> tuple[list[
         codes = [encode_blocks(255.0 * x) for x in shares]
     else:
         codes = [np.rint(255.0 * x).astype(np.uint8) for x in shares]
-    return codes, np.stack([low, high]).astype(np.float32)
+    return codes, limits
 
 
 def decode(code: NDArray[Any], limits: F32, shape: Sequence[int]) -> F32:

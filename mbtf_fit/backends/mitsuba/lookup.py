@@ -7,7 +7,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit import ops
 from mbtf_fit.backends.mitsuba.backend import MITSUBA, Loader, Numbers, Step
@@ -20,8 +19,7 @@ from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 @MITSUBA.implements(ops.Lookup)
 def _lookup(op: ops.Lookup, loader: Loader) -> Step:
     finer = op.oversampling.bit_length() - 1
-    grids = Lattice(loader.lattice.finest + finer, loader.lattice.aspect)
-    shapes = [grids.shape(s) for s in range(finer, grids.finest + 1)]
+    shapes = loader.grids(finer)[finer:]
     textures = loader.texture(op.textures, shapes[-1:] if op.level is None else shapes, op.channels)
     if op.level is None:
         return lambda u, _: textures.first(mi.Point2f(*u))

@@ -1,4 +1,4 @@
-"""Quantized textures: blocks, stored materials, and training that sees them."""
+"""Quantized textures: blocks, and stored materials."""
 
 from __future__ import annotations
 
