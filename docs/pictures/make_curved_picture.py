@@ -43,8 +43,9 @@ TILES = {"sphere": 13, "spot": 16.0, "cloth": 5.0}
 def fitted() -> Path:
     """The fitted material, made where it is missing."""
     for folder, words in {
-        "shards": f"mbtf_gen assets/twisted_wool --resolution 64 --mesh {MESH} --queries 200/texel --spp 16",
-        "material": f"mbtf_fit {OUT}/shards --time 2min",
+        "shards": f"mbtf_gen assets/twisted_wool --resolution 64 --mesh {MESH} --queries 800/texel --spp 16",
+        "material": f"mbtf_fit {OUT}/shards --steps 6000 --set network.width=32"
+        " --set network.relief.places=2",
     }.items():
         print("python -m", words, f"-o {OUT / folder}", flush=True)
         command = [sys.executable, "-m", *words.split(), "-o", str(OUT / folder), "--quiet"]

@@ -12,6 +12,7 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_fit.surface.known import KnownSurface
 
 F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
 
 
 def rough_heights(rows: int, columns: int, depth: float = 0.2, seed: int = 0) -> F32:
@@ -24,6 +25,15 @@ def rough_heights(rows: int, columns: int, depth: float = 0.2, seed: int = 0) ->
     z = np.fft.ifft2(waves).real
     z = (z - z.max()) * depth / max(float(np.ptp(z)), 1e-9)
     return z.astype(np.float32)
+
+
+def heights_at(z: F64, x: F64, y: F64) -> F64:
+    """Heights of the triangles over places (x, y); row index of z along +y."""
+    px, py = x * z.shape[1] - 0.5, y * z.shape[0] - 0.5
+    i, j = np.floor(px).astype(int), np.floor(py).astype(int)
+    fx, fy = px - i, py - j
+    a, b, c, d = (z[(j + k) % z.shape[0], (i + h) % z.shape[1]] for k in (0, 1) for h in (0, 1))
+    return a + (b - a) * fx + (c - a) * fy + (d - b - c + a) * np.maximum(0, fx + fy - 1)
 
 
 def geometry(

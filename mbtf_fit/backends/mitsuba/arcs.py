@@ -46,8 +46,7 @@ class Arc:
     ----------
     azimuth : unit vectors of the tile along which the rays proceed
     cosine, sine : of the angle between the rays and the direction downwards
-    curvature : normal curvature along the azimuth at the height where the rays start
-    start, shrinkage : that height; lengths at the surface per length there
+    curvature : normal curvature along the azimuth
     end : distance along the surface at which the rays end
     bend : an eighth of the largest second derivative of their height, at least 0
     cut : whether a ray ends at the longest distance that is traced
@@ -58,49 +57,36 @@ class Arc:
     cosine: Float
     sine: Float
     curvature: Float
-    start: Float
-    shrinkage: Float
-    half_rate: Float
     end: Float
     bend: Float
     cut: Mask
     passes: Mask
 
     @classmethod
-    def of(cls, d: Vector3f, curvature: Vector3f, depth: Float, longest: float, start: Float = 0.0) -> Arc:
-        """Rays in unit directions d over a surface of curvatures (xx, xy, yy), through a shell of a depth,
-        from a height in it, at most so many tile widths long."""
+    def of(cls, d: Vector3f, curvature: Vector3f, depth: Float, longest: float) -> Arc:
+        """Rays in unit directions d from the top of a shell of a depth over a surface of curvatures
+        (xx, xy, yy), at most so many tile widths long."""
         flat = mi.Vector2f(d.x, d.y)
         length = dr.norm(flat)
         azimuth = dr.select(length > 0.0, flat / length, mi.Vector2f(-1.0, 0.0))
         curvature = dr.dot(tilt(curvature, azimuth), azimuth)
-        shrinkage = dr.rcp(1.0 + curvature * start)
-        curvature = curvature * shrinkage
         curvature = dr.mulsign(dr.maximum(dr.abs(curvature), _STRAIGHTEST), curvature)
         sine = dr.maximum(length, _STEEPEST)
         cosine = dr.mulsign(dr.sqrt(dr.maximum(1.0 - sine * sine, 1e-12)), -d.z)
         # Up to the bottom, or else up to the top.
-        down, up = depth + start, dr.maximum(-start, 0.0)
-        drop, rise = down * (2.0 - curvature * down), up * (2.0 + curvature * up)
-        to_bottom, to_top = cosine * cosine - curvature * drop, cosine * cosine + curvature * rise
-        root = dr.sqrt(dr.maximum(to_top, 0.0))
+        drop = depth * (2.0 - curvature * depth)
+        to_bottom = cosine * cosine - curvature * drop
         last = dr.select(
-            (cosine > 0.0) & (to_bottom >= 0.0) | (to_top < 0.0),
+            to_bottom >= 0.0,
             drop / dr.maximum(cosine + dr.sqrt(dr.maximum(to_bottom, 0.0)), 1e-6),
-            dr.select(
-                cosine > 0.0,
-                (cosine + root) / dr.maximum(curvature, 1e-9),
-                rise / dr.maximum(root - cosine, 1e-6),
-            ),
+            2.0 * cosine / dr.maximum(curvature, 1e-9),
         )
+        last = dr.select(cosine > 0.0, last, 0.0)
         arc = cls(
             azimuth,
             cosine,
             sine,
             curvature,
-            start,
-            shrinkage,
-            0.5 * curvature / shrinkage,
             mi.Float(0.0),
             mi.Float(0.0),
             mi.Bool(False),
@@ -111,23 +97,23 @@ class Arc:
         end = dr.minimum(end, longest)
         # Slopes are steepest at the ends.
         steepest = dr.maximum(dr.abs(cosine / sine), dr.abs(arc.slope(end)))
-        bend = 0.125 * dr.maximum(2.0 * arc.half_rate, 0.0) * dr.fma(2.0, dr.square(steepest), 1.0)
+        bend = 0.125 * dr.maximum(curvature, 0.0) * dr.fma(2.0, dr.square(steepest), 1.0)
         return replace(arc, end=end, bend=bend, cut=cut)
 
     def position(self, t: Float) -> Float:
         """Distances along the surface at distances along the ray."""
         bent = self.curvature * t
-        return self.shrinkage / self.curvature * dr.atan2(bent * self.sine, 1.0 - bent * self.cosine)
+        return dr.atan2(bent * self.sine, 1.0 - bent * self.cosine) / self.curvature
 
     def height(self, s: Float) -> Float:
         """Heights at distances along the surface."""
-        sin, cos = dr.sincos(self.half_rate * s)
+        sin, cos = dr.sincos(0.5 * self.curvature * s)
         p = 2.0 * sin * dr.fma(self.sine, sin, -self.cosine * cos)
-        return self.start + p / (self.curvature * (self.sine - p))
+        return p / (self.curvature * (self.sine - p))
 
     def slope(self, s: Float) -> Float:
         """Slopes of the ray, relative to the surface there, at distances along the surface."""
-        sin, cos = dr.sincos(2.0 * self.half_rate * s)
+        sin, cos = dr.sincos(self.curvature * s)
         return (self.sine * sin - self.cosine * cos) / (self.sine * cos + self.cosine * sin)
 
 
@@ -166,7 +152,7 @@ def trace_arcs(
     """
     x, y = (c - dr.floor(c) for c in u)
     ray = mi.Ray3f(
-        mi.Point3f(x - 0.5, (y - 0.5) * aspect, arc.start), mi.Vector3f(arc.azimuth.x, arc.azimuth.y, 0.0)
+        mi.Point3f(x - 0.5, (y - 0.5) * aspect, 0.0), mi.Vector3f(arc.azimuth.x, arc.azimuth.y, 0.0)
     )
     block, constants = start_traversal(heightfield, ray, mi.Bool(active), mi.Bool(False))
     state = _follow(heightfield, ArcState(block, mi.Float(0.0)), constants, arc)

@@ -7,7 +7,7 @@ over the footprint and over the light kernel of the data. ``eval`` therefore ret
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, get_args
@@ -19,13 +19,14 @@ import numpy as np
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.pictures import pixel_sigma
 from mbtf_fit.backends.mitsuba.backend import Arithmetic
-from mbtf_fit.backends.mitsuba.curvature import curvature, in_axes, with_normal_partials
+from mbtf_fit.backends.mitsuba.curvature import curvature, in_axes, rounded, with_normal_partials
 from mbtf_fit.backends.mitsuba.evaluator import Evaluator, Values
+from mbtf_fit.backends.mitsuba.frame import Frame
 from mbtf_fit.backends.mitsuba.mixture import Mixture
 from mbtf_fit.backends.mitsuba.names import BSDF_NAME, footprints_provided, refuse_unknown
 from mbtf_fit.backends.mitsuba.partials import FootprintRequest, uv_partials
 from mbtf_fit.backends.mitsuba.shade import DirectLight
-from mbtf_fit.backends.mitsuba.shell import ShellHit, clamped, tilted
+from mbtf_fit.backends.mitsuba.shell import ShellHit, clamped
 from mbtf_fit.backends.mitsuba.stored_material import StoredMaterial, read_material
 from mbtf_fit.material.format import QUERY
 from mbtf_fit.ops import Trace
@@ -39,7 +40,6 @@ from mbtf_gen.engine.types import (
     Properties,
     Scene,
     SurfaceInteraction3f,
-    Vector2f,
     Vector3f,
 )
 
@@ -54,65 +54,6 @@ PARAMETERS = ("material", "uv_scale", "sigma", "networks", "sampling", "silhouet
 _log = logging.getLogger(__name__)
 # Materials with a warning of missing footprints.
 _warned: set[Path] = set()
-
-
-@dataclass(frozen=True)
-class Frame:
-    """The tile's frame at hits: x and y are steps of the tile in the shading frame, in units in which they
-    span an area of 1, as stretched and sheared as texture coordinates are. Directions of the tile are those
-    in which rays cross its heights. It is upside down where side is -1; then tilted, over a curved surface.
-    """
-
-    x: Vector2f
-    y: Vector2f
-    side: Float
-    tilt: Vector2f | None = None
-
-    @classmethod
-    def at(cls, si: SurfaceInteraction3f, two_sided: bool = False, scale: Any = (1.0, 1.0)) -> Frame:
-        """x along ∂p/∂u, y along -∂p/∂v of Mitsuba (images have row 0 there at v = 0), of tiles that have a
-        scale per unit of u and v, z towards the viewer where the surface is two-sided."""
-        du, dv = si.sh_frame.to_local(si.dp_du) / scale[0], si.sh_frame.to_local(si.dp_dv) / -scale[1]
-        area = dr.abs(du.x * dv.y - du.y * dv.x)
-        good, unit = area > 0.0, dr.rsqrt(area)
-        x = dr.select(good, mi.Vector2f(du.x, du.y) * unit, mi.Vector2f(1.0, 0.0))
-        y = dr.select(good, mi.Vector2f(dv.x, dv.y) * unit, mi.Vector2f(0.0, 1.0))
-        side = dr.select(si.wi.z < 0, mi.Float(-1.0), 1.0) if two_sided else mi.Float(1.0)
-        return cls(x, y, side)
-
-    def to_tile(self, w: Vector3f) -> Vector3f:
-        """Local direction → the tile's."""
-        if self.tilt is not None:
-            w = tilted(w, self.tilt)
-        x = self._hand * dr.fma(w.x, self.y.y, -w.y * self.y.x)
-        y = self._hand * dr.fma(w.y, self.x.x, -w.x * self.x.y)
-        return dr.normalize(mi.Vector3f(x, y, self.side * w.z))
-
-    def over(self, tilt: Vector2f) -> Frame:
-        """The frame where the normal has changed by a slope over the tile's steps."""
-        x = self._hand * dr.fma(tilt.x, self.y.y, -tilt.y * self.x.y)
-        y = self._hand * dr.fma(tilt.y, self.x.x, -tilt.x * self.y.x)
-        return replace(self, tilt=mi.Vector2f(x, y))
-
-    @property
-    def _hand(self) -> Float:
-        """-1 where the frame is a mirror image."""
-        return self.x.x * self.y.y - self.x.y * self.y.x
-
-    def _vector(self, w: Vector3f) -> Vector3f:
-        return mi.Vector3f(
-            dr.fma(w.x, self.x.x, w.y * self.y.x), dr.fma(w.x, self.x.y, w.y * self.y.y), self.side * w.z
-        )
-
-    def to_local(self, w: Vector3f) -> Vector3f:
-        """Inverse of :meth:`to_tile`."""
-        w = dr.normalize(self._vector(w))
-        return w if self.tilt is None else tilted(w, self.tilt, back=True)
-
-    def length(self, w: Vector3f) -> Float:
-        """Length on the surface of the tile's unit vectors; its cube is the solid angle in the tile's frame
-        over that on the surface."""
-        return dr.norm(self._vector(w))
 
 
 class MbtfBSDF(mi.BSDF):
@@ -244,7 +185,8 @@ class MbtfBSDF(mi.BSDF):
             return View(self, frame, u, level, wi, wi.z > 0)
         # The project's integrator gives them with the footprint.
         bent = si if footprints_provided.get() else with_normal_partials(si)
-        form = in_axes(curvature(bent, self.uv_scale.x * self.uv_scale.y), frame.x, frame.y)
+        form = rounded(curvature(bent, self.uv_scale.x * self.uv_scale.y), self.shell.depth)
+        form = in_axes(form, frame.x, frame.y)
         hit = self.shell.meet(u, level, wi, form, self.min_cos, lambda tilt: frame.over(tilt).to_tile(si.wi))
         frame = frame.over(hit.tilt)
         # Rays leave a mesh through its back, where shading normals of coarse ones may face them.
@@ -385,14 +327,12 @@ class View:
             values = self.values
             if ctx.mode == mi.TransportMode.Importance:
                 values, light = evaluator.stage1(self.u, self.level, light), viewer
-            value = evaluator.value(values, light) * cosine * dr.maximum(wo.z, 0.0)
+            value = evaluator.value(values, light, frame=self.frame) * cosine * dr.maximum(wo.z, 0.0)
             return value if hit is None else value * hit.share
         least = self.bsdf.min_cos
-        visible = hit.visibility(wo, least)
-        lit = DirectLight(visible, wo, dr.maximum(wo.z, least), least, hit.flat)
-        curved = hit.light_cosine(wo, least, visible)
-        cosine *= dr.select(hit.flat, dr.maximum(wo.z, 0.0), curved)
-        return evaluator.value(self.values, light, lit) * cosine * hit.share
+        lit = DirectLight(wo, least, hit.flat, hit.curvature, hit.shell.depth, hit.heights)
+        cosine *= dr.maximum(wo.z, dr.select(hit.flat, 0.0, least))
+        return evaluator.value(self.values, light, lit, self.frame) * cosine * hit.share
 
 
 def _check_conformance(evaluator: Evaluator, stored: StoredMaterial) -> None:

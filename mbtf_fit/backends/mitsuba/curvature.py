@@ -7,12 +7,16 @@ asked again.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from mbtf_gen.engine.types import Float, SurfaceInteraction3f, Vector2f, Vector3f
+
+# Largest depth of a shell in radii of curvature: sharper edges are taken to be that round.
+DEEPEST = 0.5
 
 
 def with_normal_partials(si: SurfaceInteraction3f, active: Any = True) -> SurfaceInteraction3f:
@@ -67,3 +71,11 @@ def in_axes(form: tuple[Float, Float, Float], x: Vector2f, y: Vector2f) -> Vecto
     xx, xy, yy = form
     ax, ay = (mi.Vector2f(xx * e.x + xy * e.y, xy * e.x + yy * e.y) for e in (x, y))
     return mi.Vector3f(dr.dot(ax, x), dr.dot(ax, y), dr.dot(ay, y))
+
+
+def rounded(form: Sequence[Float], depth: Float) -> tuple[Float, Float, Float]:
+    """The form (xx, xy, yy) where edges are sharper than a shell of a depth can follow."""
+    xx, xy, yy = form
+    largest = dr.maximum(dr.abs(xx), dr.abs(yy)) + dr.abs(xy)
+    scale = dr.minimum(1.0, DEEPEST / dr.maximum(largest * depth, 1e-9))
+    return scale * xx, scale * xy, scale * yy

@@ -12,12 +12,13 @@ from numpy.typing import ArrayLike
 from mbtf_core.errors import InputError
 from mbtf_fit.backends.mitsuba import lookup, network, shade
 from mbtf_fit.backends.mitsuba.backend import MITSUBA, Arithmetic, Loader, Numbers, Step
+from mbtf_fit.backends.mitsuba.frame import Frame
 from mbtf_fit.backends.mitsuba.mixture import Mixture
 from mbtf_fit.backends.mitsuba.stored_material import F32, StoredMaterial
 from mbtf_fit.backends.mitsuba.textures import Textures
 from mbtf_fit.material.format import DESCRIPTION_NAME
-from mbtf_fit.ops import Gate, Operation, Shade, Trace, stages
-from mbtf_fit.ops.operation import SAMPLER, output_names, parse
+from mbtf_fit.ops import Operation, Shade, Trace, stages
+from mbtf_fit.ops.operation import SAMPLER, output_names
 from mbtf_fit.ops.sampler import sampler_sizes
 from mbtf_gen.engine.types import Color3f, Float, Point2f, Vector3f
 
@@ -61,7 +62,7 @@ class Evaluator:
         first, second = ([(op, MITSUBA[op](op, loader)) for op in part] for part in stages(stored.operations))
         self._first, self._second, self._last = first, second, stored.operations[-1].output
         self._sampler = [(op, MITSUBA[op](op, loader)) for op in stored.sampler]
-        self._core = _core(stored.operations)
+        self._shaded = next((op.output for op in stored.operations if isinstance(op, Shade)), None)
         self._coefficients = None if stored.transmittance is None else Textures(stored.transmittance)
 
     def level(self, sigma: Float) -> Float:
@@ -74,18 +75,31 @@ class Evaluator:
         values = {"u": list(u), "level": [level], "omega_o": list(omega_o), **(given or {})}
         return _run([step for step in self._first if step[0].output not in values], values)
 
-    def stage2(self, values: Values, omega_i: Vector3f, lit: shade.DirectLight | None = None) -> Values:
-        """All values, from those of stage 1 and unit vectors towards the light, `lit` on curved surfaces."""
-        return _run(self._second, {**values, "omega_i": list(omega_i)}, lit)
+    def stage2(
+        self,
+        values: Values,
+        omega_i: Vector3f,
+        lit: shade.DirectLight | None = None,
+        frame: Frame | None = None,
+    ) -> Values:
+        """All values, from those of stage 1 and unit vectors towards the light, of a tile in a surface's
+        frame, `lit` where the surface is curved."""
+        return _run(self._second, {**values, "omega_i": list(omega_i)}, lit, frame)
 
-    def value(self, values: Values, omega_i: Vector3f, lit: shade.DirectLight | None = None) -> Color3f:
+    def value(
+        self,
+        values: Values,
+        omega_i: Vector3f,
+        lit: shade.DirectLight | None = None,
+        frame: Frame | None = None,
+    ) -> Color3f:
         """The value in 1/sr, at least 0, of values of stage 1."""
-        found = self.stage2(values, omega_i, lit)
+        found = self.stage2(values, omega_i, lit, frame)
         value = mi.Color3f(*found[self._last])
-        if lit is not None and self._core is not None:
-            # Of light below that of the data the network knows nothing, and its hints grow without bounds.
-            name, part = self._core
-            value = dr.lerp(mi.Color3f(*found[name][part]), value, lit.known)
+        if lit is not None:
+            # Light below that of the data reaches high places, but little of what others scatter.
+            once = mi.Color3f(0.0) if self._shaded is None else mi.Color3f(*found[self._shaded][3:6])
+            value = dr.lerp(once, value, lit.known)
         return dr.maximum(value, 0.0)
 
     def mixture(self, values: Values, viewer: Vector3f) -> Mixture:
@@ -131,21 +145,15 @@ class Evaluator:
         return out
 
 
-def _core(operations: Sequence[Operation]) -> tuple[str, slice] | None:
-    """Where the single scattering is that the last operation scales; None if it scales none."""
-    last = operations[-1]
-    if not isinstance(last, Gate):
-        return None
-    name, part = parse(last.x)
-    return (name, part) if any(isinstance(op, Shade) and op.output == name for op in operations) else None
-
-
 def _run(
-    steps: Sequence[tuple[Operation, Step]], values: Values, lit: shade.DirectLight | None = None
+    steps: Sequence[tuple[Operation, Step]],
+    values: Values,
+    lit: shade.DirectLight | None = None,
+    frame: Frame | None = None,
 ) -> Values:
     """`values`, and those that the steps of operations compute."""
     for op, step in steps:
-        given = {"lit": lit} if isinstance(op, Shade) else {}
+        given = {"frame": frame, "lit": lit} if isinstance(op, Shade) else {}
         found = step(*op.arguments(lambda name, part: values[name][part]), **given)
         values.update(zip(output_names(op), found if isinstance(found, tuple) else (found,), strict=True))
     return values

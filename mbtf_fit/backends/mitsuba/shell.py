@@ -1,4 +1,4 @@
-"""The shell of heights of a material over a curved surface: where view rays meet it, and its light.
+"""The shell of heights of a material over a curved surface: where view rays meet it.
 
 The surface is the top of the shell. A ray that misses the heights passes through, so that silhouettes are
 those of the displacement.
@@ -13,17 +13,14 @@ import drjit as dr
 import mitsuba as mi
 
 from mbtf_fit.backends.mitsuba.arcs import Arc, tilt, trace_arcs
+from mbtf_fit.backends.mitsuba.curvature import rounded
 from mbtf_fit.backends.mitsuba.view_rays import heights_below
 from mbtf_fit.ops import Trace
 from mbtf_gen.engine.types import Float, Mask, Point2f, Ray3f, Vector2f, Vector3f
 from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
-# Largest depth of a shell in radii of curvature: sharper edges are traced as if they were that round.
-DEEPEST = 0.5
 # Depth below the lowest height at which rays end, as a share of the shell: the rounding of single precision.
 _MARGIN = 1e-3
-# Height above the surface at which shadow rays start, as a share of the shell.
-_CLEARANCE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -53,32 +50,6 @@ class ShellHit:
     leaves: Mask
     omega_o: Vector3f
     values: dict[str, list[Float]]
-
-    def light_cosine(self, omega_i: Vector3f, least: Float, visible: Sequence[tuple[Float, Float]]) -> Float:
-        """The light's cosine. Below the least with data it is that where the light is visible; elsewhere,
-        light that others scatter falls to 0 at the dip of the horizon from the top of the shell."""
-        flat = mi.Vector2f(omega_i.x, omega_i.y)
-        bend = dr.dot(tilt(self.curvature, flat), flat)
-        dip = dr.minimum(dr.sqrt(dr.maximum(2.0 * bend * self.shell.depth, 0.0)), 1.0)
-        low = least * dr.square(dr.maximum(omega_i.z + dip, 0.0) / (least + dip))
-        share = sum(curved for curved, _ in visible) / len(visible)
-        return dr.select(omega_i.z < least, dr.lerp(low, least, share), omega_i.z)
-
-    def visibility(self, omega_i: Vector3f, least: Float) -> list[tuple[Float, Float]]:
-        """Visibility of the light from the intersection of each place, 1 or 0, and what it would be over a
-        plane, where the light's cosine is at least that of the data; light in the frame there."""
-        out, hits, shell = [], self.values[self.shell.op.hits], self.shell
-        longest = shell.op.crossings
-        for k, height in enumerate(self.heights):
-            # Off the surface by more than the rounding of its height.
-            start = dr.fma(_CLEARANCE, shell.depth, height)
-            at = mi.Point2f(*hits[2 * k : 2 * k + 2])
-            arc = Arc.of(omega_i, self.curvature, shell.depth, float(longest), start)
-            curved, *_ = trace_arcs(shell.heightfield, at, arc, shell.aspect, ~self.flat)
-            known = ~self.flat & (omega_i.z > least)
-            plane, *_ = shell.heightfield.occluded(shell.ray(at, start, omega_i), known, longest)
-            out.append((dr.select(curved, mi.Float(0.0), 1.0), dr.select(plane, mi.Float(0.0), 1.0)))
-        return out
 
 
 @dataclass(frozen=True)
@@ -136,8 +107,7 @@ class Shell:
     ) -> ShellHit:
         """Trace view rays over a surface of curvatures (xx, xy, yy), in 1/tile width; `over` is the direction
         towards the viewer in the frame at a tilt."""
-        largest = dr.maximum(dr.abs(curvature.x), dr.abs(curvature.z)) + dr.abs(curvature.y)
-        curvature = curvature * dr.minimum(1.0, DEEPEST / dr.maximum(largest * self.depth, 1e-9))
+        curvature = mi.Vector3f(*rounded(curvature, self.depth))
         flat = (curvature.x == 0) & (curvature.y == 0) & (curvature.z == 0)
         arc = Arc.of(-omega_o, curvature, self.depth, float(self.op.crossings))
         lowest = clamped(omega_o, min_cos)
@@ -200,14 +170,3 @@ def displaced(u: Sequence[Float], height: Float, omega_o: Sequence[Float], aspec
     """uv of the points at heights on lines through points of the plane."""
     step = height / omega_o[2]
     return [dr.fma(step, omega_o[0], u[0]), dr.fma(step / aspect, omega_o[1], u[1])]
-
-
-def tilted(w: Vector3f, tilt: Vector2f, back: bool = False) -> Vector3f:
-    """Directions in a frame whose normal is rotated by an angle towards a direction, or back from it."""
-    angle = dr.norm(tilt)
-    d = dr.select(angle > 0.0, tilt / angle, mi.Vector2f(1.0, 0.0))
-    sin, cos = dr.sincos(-angle if back else angle)
-    p = dr.fma(w.x, d.x, w.y * d.y)
-    step = dr.fma(p, cos, -w.z * sin) - p
-    rotated = mi.Vector3f(dr.fma(step, d.x, w.x), dr.fma(step, d.y, w.y), dr.fma(p, sin, w.z * cos))
-    return dr.select(angle > 0.0, rotated, w)
