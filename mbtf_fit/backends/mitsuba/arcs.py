@@ -18,12 +18,13 @@ the block if ``√f + √g > 2 √m``, where m is an eighth of that derivative t
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
-from mbtf_gen.engine.types import Float, Mask, Point2f, Vector2f, Vector3f
+from mbtf_gen.engine.types import Float, Mask, Point2f, Point3f, Vector2f, Vector3f
 from mbtf_gen.tile.tracers.heightfield import HeightField
 from mbtf_gen.tile.tracers.heightfield_tracer import (
     Block,
@@ -124,6 +125,12 @@ def tilt(curvature: Vector3f, step: Vector2f) -> Vector2f:
     )
 
 
+def on_top(u: Iterable[Float], aspect: float) -> Point3f:
+    """Points of the top of the shell, by uv, as rays start there to be traced to the heights."""
+    x, y = (c - dr.floor(c) for c in u)
+    return mi.Point3f(x - 0.5, (y - 0.5) * aspect, 0.0)
+
+
 @dataclass
 class ArcState:
     """State of rays: the block's traversal, and the distance along the surface."""
@@ -150,10 +157,7 @@ def trace_arcs(
     (Mask, Float, Float)
         Whether a ray meets the heights; the distance along the surface and the height at which.
     """
-    x, y = (c - dr.floor(c) for c in u)
-    ray = mi.Ray3f(
-        mi.Point3f(x - 0.5, (y - 0.5) * aspect, 0.0), mi.Vector3f(arc.azimuth.x, arc.azimuth.y, 0.0)
-    )
+    ray = mi.Ray3f(on_top(u, aspect), mi.Vector3f(arc.azimuth.x, arc.azimuth.y, 0.0))
     block, constants = start_traversal(heightfield, ray, mi.Bool(active), mi.Bool(False))
     state = _follow(heightfield, ArcState(block, mi.Float(0.0)), constants, arc)
     return _meet(heightfield, state, constants, arc, active)

@@ -13,6 +13,7 @@ import numpy as np
 from mbtf_core.data.schema import CLEARCOAT_F0
 from mbtf_core.errors import InputError
 from mbtf_fit import ops
+from mbtf_fit.backends.mitsuba.arcs import tilt
 from mbtf_fit.backends.mitsuba.backend import MITSUBA, Loader, Numbers, Step, opaque
 from mbtf_fit.backends.mitsuba.curvature import DEEPEST
 from mbtf_fit.backends.mitsuba.frame import Frame
@@ -62,9 +63,8 @@ class DirectLight:
     @property
     def bend(self) -> Float:
         """Curvature along the light's azimuth."""
-        x, y = self.omega_i.x, self.omega_i.y
-        form = self.curvature.x * x * x + 2.0 * self.curvature.y * x * y + self.curvature.z * y * y
-        return form / dr.maximum(dr.fma(x, x, y * y), 1e-12)
+        flat = mi.Vector2f(self.omega_i.x, self.omega_i.y)
+        return dr.dot(tilt(self.curvature, flat), flat) / dr.maximum(dr.squared_norm(flat), 1e-12)
 
     def dip(self, drop: Float) -> Float:
         """Sine of the angle by which the horizon is below the plane, at a height over a sphere."""
@@ -140,11 +140,12 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
             """Share of the footprint's horizons that are lower."""
             return dr.fma(0.5, dr.erf((elevation - mean) * scale), 0.5)
 
+        visible = lower(elevation)
         if lit is None:
-            return lower(elevation)
+            return visible
         # No horizon is below the lowest one, as the Gaussian has them.
-        inside = dr.maximum(lower(elevation) - (1.0 - lit.reach) * lower(lit.lowest), 0.0)
-        return dr.select(lit.flat, lower(elevation), inside)
+        inside = dr.maximum(visible - (1.0 - lit.reach) * lower(lit.lowest), 0.0)
+        return dr.select(lit.flat, visible, inside)
 
     def at(
         hit: Point2f,

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from mbtf_fit.backends.mitsuba.arcs import Arc, tilt, trace_arcs
+from mbtf_fit.backends.mitsuba.arcs import Arc, on_top, tilt, trace_arcs
 from mbtf_fit.backends.mitsuba.curvature import rounded
 from mbtf_fit.backends.mitsuba.view_rays import heights_below
 from mbtf_fit.ops import Trace
-from mbtf_gen.engine.types import Float, Mask, Point2f, Ray3f, Vector2f, Vector3f
+from mbtf_gen.engine.types import Float, Mask, Point2f, Vector2f, Vector3f
 from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
 # Depth below the lowest height at which rays end, as a share of the shell: the rounding of single precision.
@@ -88,13 +88,8 @@ class Shell:
         self, places: Sequence[Sequence[Float]], omega_o: Sequence[Float], active: Mask = True
     ) -> list[Float]:
         """Heights at which rays through points of a plane meet the heights."""
-        rays = [self.ray(u, mi.Float(0.0), -mi.Vector3f(*omega_o)) for u in places]
+        rays = [mi.Ray3f(on_top(u, self.aspect), -mi.Vector3f(*omega_o)) for u in places]
         return heights_below(self.heightfield, rays, self.op.crossings, active)
-
-    def ray(self, u: Sequence[Float], z: Float, d: Vector3f) -> Ray3f:
-        """Rays over a plane, from a height over points of it, as they are traced to the heights."""
-        x, y = (c - dr.floor(c) for c in u)
-        return mi.Ray3f(mi.Point3f(x - 0.5, (y - 0.5) * self.aspect, z), d)
 
     def meet(
         self,
