@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
+import platform
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mbtf_core.data.documents import software_versions
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256, read_json, write_json
 from mbtf_core.files.editable import changed
@@ -240,6 +243,7 @@ def _run(folder: Path, stage: Stage, decision: Decision) -> Stamp:
 
 
 RUN = OutputKind("run.json", "mbtf-run", 2, "a run")
+_SOFTWARE = ("mbtf", "mitsuba", "drjit", "torch", "numpy", "scipy", "trimesh", "flip-evaluator")
 SHARDS, FITS, COMPARE, REPORT = "shards", "fits", "compare", "report.html"
 VIEWER = "viewer.html"
 
@@ -259,15 +263,6 @@ def write_run_record(folder: Path, recipe: Recipe, command: str, *, overwrite: b
 
 def machine() -> dict[str, str]:
     """Versions of the software that results depend on, and the system."""
-    import os
-    import platform
-    from importlib.metadata import PackageNotFoundError, version
-
-    out = {"python": platform.python_version()}
-    for name in ("mbtf", "mitsuba", "drjit", "torch", "numpy", "scipy", "trimesh", "flip-evaluator"):
-        try:
-            out[name] = version(name)
-        except PackageNotFoundError:
-            out[name] = "not installed"
-    out["system"] = f"{platform.system()} {platform.machine()}, {os.cpu_count()} processors"
-    return out
+    found = software_versions(*_SOFTWARE)
+    system = f"{platform.system()} {found.pop('machine')}, {os.cpu_count()} processors"
+    return {**found, "system": system}

@@ -24,11 +24,11 @@ def is_significant(e: Estimate) -> bool:
     return not math.isfinite(e.value) or abs(e.value) > SIGNIFICANT * e.error
 
 
-def estimate_text(e: Estimate, factor: float = 1.0, unit: str = "") -> str:
+def estimate_text(e: Estimate, factor: float = 1.0) -> str:
     """``0.123 ± 0.004``, or ``not significant (0.003 ± 0.004)``."""
     if not math.isfinite(e.value):
         return "undefined"
-    text = signed(f"{e.scaled(factor)}{unit}")
+    text = signed(str(e.scaled(factor)))
     return text if is_significant(e) else not_significant(text)
 
 

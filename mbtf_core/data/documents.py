@@ -150,10 +150,10 @@ class Sidecar(BaseModel, allow_inf_nan=False):
         return {"format": FORMAT_NAME, "schema": SCHEMA_VERSION, **self.model_dump()}
 
 
-def software_versions() -> dict[str, str]:
-    """Versions of the software that the values depend on."""
+def software_versions(*names: str) -> dict[str, str]:
+    """Versions of the packages `names`, by default of those that the values of a data set depend on."""
     out = {"python": platform.python_version(), "machine": platform.machine()}
-    for name in ("mbtf", "mitsuba", "drjit", "numpy", "trimesh"):
+    for name in names or ("mbtf", "mitsuba", "drjit", "numpy", "trimesh"):
         try:
             out[name] = version(name)
         except PackageNotFoundError:

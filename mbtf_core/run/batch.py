@@ -11,7 +11,7 @@ import re
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from mbtf_core.errors import reason
@@ -28,18 +28,9 @@ _SYSTEMS = {
     "oar": ("OARCluster", "oarsub"),
     "htcondor": ("HTCondorCluster", "condor_submit"),
 }
-# Options that dask-jobqueue has renamed: where both names are given, it ignores the old one.
-_RENAMED = {
-    "env_extra": "job_script_prologue",
-    "job_extra": "job_extra_directives",
-    "header_skip": "job_directives_skip",
-    "extra": "worker_extra_args",
-}
-_ACCOUNTS = {"slurm": {"project": "account"}, "pbs": {"project": "account"}}
-# Options whose values follow from keys of the file.
+# Options whose values follow from keys of the file, and lists, to which ours are added.
 _OURS = {"cores": "threads", "processes": "workers", "memory": "memory", "walltime": "walltime"}
-# Walltimes in the configuration that dask-jobqueue ships.
-_UNSET = (None, "00:30:00", "00:30")
+_LISTS = ("worker_extra_args", "job_script_prologue")
 
 
 def site_preload() -> list[str]:
@@ -49,45 +40,29 @@ def site_preload() -> list[str]:
     return [*([found] if isinstance(found, str) else found), PRELOAD]
 
 
-@contextlib.contextmanager
-def _site_options(
-    engine: str, options: Mapping[str, Any], note: Callable[[str], None]
-) -> Iterator[dict[str, Any]]:
-    """Options of a file completed by those of Dask's configuration, by their present names, for a block.
+def _site_options(engine: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a file, with the lists of Dask's configuration where it gives none; dask-jobqueue reads the
+    rest of that itself.
 
     Raises
     ------
-    ValueError : an option is a key of the file, or is given by both of its names
+    ValueError : an option is a key of the file
     """
     dask = import_extra("dask", "--cluster")
-    renamed = {**_RENAMED, **_ACCOUNTS.get(engine, {})}
     given = {key: value for key, value in options.items() if value is not None}
     for key, ours in _OURS.items():
         if key in given:
             raise ValueError(f"options: '{key}' follows from '{ours}' of the file: give that")
     section = f"jobqueue.{given.get('config_name', engine)}"
-    unused = [key for key in _OURS if dask.config.get(f"{section}.{key}", None) not in _UNSET]
-    if unused:
-        ours = ", ".join(dict.fromkeys(_OURS[key] for key in unused))
-        note(f"cluster: {', '.join(unused)} of Dask's {section} is not used; the --cluster file has {ours}")
-    for old, new in renamed.items():
-        if old in given:
-            if new in given:
-                raise ValueError(f"options: '{old}' is the old name of '{new}': give one of them")
-            given[new] = given.pop(old)
-        stated = (dask.config.get(f"{section}.{name}", None) for name in (new, old))
-        found = given.get(new, next((value for value in stated if value), None))
-        if found is not None:
-            given[new] = [found] if isinstance(found, str) and new != "account" else found
-    # dask-jobqueue would find the old names too, and warn.
-    with dask.config.set({f"{section}.{old}": None for old in renamed}):
-        logs = dask.config.get(f"{section}.log-directory", None) or "worker-logs"
-        yield {"log_directory": logs, **given}
+    for name in _LISTS:
+        found = given.get(name) or dask.config.get(f"{section}.{name}", None) or []
+        given[name] = [found] if isinstance(found, str) else found
+    return {"log_directory": dask.config.get(f"{section}.log-directory", None) or "worker-logs", **given}
 
 
 @contextlib.contextmanager
 def submitted_jobs(
-    config: ClusterConfig, environment: Mapping[str, str], refused: list[str], note: Callable[[str], None]
+    config: ClusterConfig, environment: Mapping[str, str], refused: list[str]
 ) -> Iterator[Any]:
     """A Dask cluster of jobs, which are canceled when the block ends.
 
@@ -96,7 +71,6 @@ def submitted_jobs(
     config : of the jobs
     environment : variables of the workers
     refused : gets the reasons why jobs cannot be submitted
-    note : receives lines for the user
 
     Raises
     ------
@@ -122,33 +96,33 @@ def submitted_jobs(
     memory = {f"DASK_DISTRIBUTED__WORKER__MEMORY__{key.upper()}": str(v) for key, v in MEMORY.items()}
     exports = [f"export {key}={value}" for key, value in {**environment, **memory}.items()]
     system = getattr(dask_jobqueue, name)
-    with _site_options(config.engine, config.options, note) as own:
-        options: dict[str, Any] = {
-            **own,
-            "cores": config.threads,
-            "processes": 1,
-            "memory": f"{int(config.memory or 2e9 * config.threads)}B",
-            "walltime": f"{hours:02d}:{rest // 60:02d}:{rest % 60:02d}",
-            # What a site needs comes on top.
-            "worker_extra_args": [*extra, *own.get("worker_extra_args", [])],
-            "job_script_prologue": [*own.get("job_script_prologue", []), *exports],
-        }
-        try:
-            cluster = system(job_cls=_reporting(system.job_cls, refused), **options)
-        except (TypeError, ValueError) as error:
-            # Its text goes on with all the options.
-            unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
-            if unknown is None:
-                raise
-            raise ValueError(f"options: {name} has no option '{unknown[1]}'") from None
-        try:
-            # Unlike scale(), this replaces workers that have ended.
-            cluster.adapt(minimum=config.workers, maximum=config.workers)
-            yield cluster
-        finally:
-            # Jobs that were never submitted cannot be closed; the batch system may not answer.
-            with contextlib.suppress(Exception):
-                call_within(config.timeout, cluster.close)
+    own = _site_options(config.engine, config.options)
+    options: dict[str, Any] = {
+        **own,
+        "cores": config.threads,
+        "processes": 1,
+        "memory": f"{int(config.memory or 2e9 * config.threads)}B",
+        "walltime": f"{hours:02d}:{rest // 60:02d}:{rest % 60:02d}",
+        # What a site needs comes on top.
+        "worker_extra_args": [*extra, *own["worker_extra_args"]],
+        "job_script_prologue": [*own["job_script_prologue"], *exports],
+    }
+    try:
+        cluster = system(job_cls=_reporting(system.job_cls, refused), **options)
+    except (TypeError, ValueError) as error:
+        # Its text goes on with all the options.
+        unknown = re.search(r"unexpected keyword argument '(\w+)'", str(error))
+        if unknown is None:
+            raise
+        raise ValueError(f"options: {name} has no option '{unknown[1]}'") from None
+    try:
+        # Unlike scale(), this replaces workers that have ended.
+        cluster.adapt(minimum=config.workers, maximum=config.workers)
+        yield cluster
+    finally:
+        # Jobs that were never submitted cannot be closed; the batch system may not answer.
+        with contextlib.suppress(Exception):
+            call_within(config.timeout, cluster.close)
 
 
 def _reporting(job: Any, refused: list[str]) -> Any:

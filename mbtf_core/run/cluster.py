@@ -286,7 +286,7 @@ def _open_workers(where: str, note: Callable[[str], None]) -> Iterator[DaskRunne
         if config.address is not None:
             note(f"cluster: connecting to {config.address}, at most {limit}")
         try:
-            started = config.address or stack.enter_context(_started(config, refused, note))
+            started = config.address or stack.enter_context(_started(config, refused))
             # Dask's own time limit leaves out the first answer; its error is the better one.
             client = call_within(
                 config.timeout,
@@ -314,11 +314,11 @@ def _open_workers(where: str, note: Callable[[str], None]) -> Iterator[DaskRunne
         yield cluster
 
 
-def _started(config: ClusterConfig, refused: list[str], note: Callable[[str], None]) -> Any:
+def _started(config: ClusterConfig, refused: list[str]) -> Any:
     """A Dask cluster, which ends its workers when its block ends."""
     environment = {THREADS_VARIABLE: str(config.threads), "OMP_NUM_THREADS": str(config.threads)}
     if config.engine != "local":
-        return submitted_jobs(config, environment, refused, note)
+        return submitted_jobs(config, environment, refused)
     return _local_workers(config, environment)
 
 

@@ -21,7 +21,6 @@ from mbtf_core.app.options import (
     Set,
     Switch,
     Time,
-    Verbose,
     check_error,
     command_line,
 )
@@ -278,12 +277,8 @@ def _report(
     console.report(data, "\n".join(lines))
 
 
-def list_recipes(
-    folder: Path = Path("pipelines"), /, *, verbose: Verbose = False, console: Console = CONSOLE
-) -> None:
+def list_recipes(folder: Path = Path("pipelines"), /, *, console: Console = CONSOLE) -> None:
     """List the recipes of a folder.
-
-    With --verbose also the stages that would run, given earlier runs.
 
     Parameters
     ----------
@@ -292,27 +287,18 @@ def list_recipes(
     """
     if not folder.is_dir():
         raise InputError("no such folder", where=folder)
-    found = [_entry(path, verbose) for path in sorted(folder.glob("*.y*ml"))]
-    lines = []
-    for entry in found:
-        lines.append(f"{entry['file']}: {entry['error'] or entry['description'] or entry['name']}")
-        lines += [f"    {stage}: {state}" for stage, state in entry["stages"].items()]
+    found = [_entry(path) for path in sorted(folder.glob("*.y*ml"))]
+    lines = [f"{e['file']}: {e['error'] or e['description'] or e['name']}" for e in found]
     console.report({"recipes": found}, "\n".join(lines) or f"{folder}: no recipes")
 
 
-def _entry(path: Path, verbose: bool) -> dict[str, Any]:
+def _entry(path: Path) -> dict[str, Any]:
     from mbtf_pipeline.collection.recipes import load
-    from mbtf_pipeline.recipe import Recipe
-    from mbtf_pipeline.run import survey
 
-    keys: dict[str, Any] = dict.fromkeys(("name", "description", "error"))
-    entry = {"file": str(path), **keys, "stages": {}}
+    entry: dict[str, Any] = {"file": str(path), **dict.fromkeys(("name", "description", "error"))}
     try:
         recipe = load(path)
         entry |= {"name": recipe.name, "description": recipe.description, "folder": str(recipe.folder)}
-        if verbose and isinstance(recipe, Recipe):
-            decisions = survey(recipe, recipe.folder)
-            entry["stages"] = {name: reason or "up to date" for name, reason in decisions.items()}
     except MbtfError as error:
         # The recipe's path stands before the message already.
         first = error.message.splitlines()[0]

@@ -83,11 +83,6 @@ class Evidence:
         """Longest total time that is forecast, in seconds."""
         return self.overhead + FARTHEST * self.work[-1]
 
-    @property
-    def next_time(self) -> float | None:
-        """Shortest usual total time that is not forecast, in seconds; None where all are."""
-        return next((t for t in _TIMES if t > _BEYOND * self.farthest), None)
-
     def error_after(self, seconds: float) -> Interval | None:
         """Forecast of the error after a total time; None where runs are too few, or the time is too long."""
         if self.curve is None or seconds > self.farthest:

@@ -4,6 +4,7 @@ follows: error bars of seeds, the Pareto front."""
 from __future__ import annotations
 
 import math
+import shlex
 import statistics
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,11 +17,15 @@ from mbtf_core.files.atomic import data_sha256, read_json, write_json
 from mbtf_core.forecast import processor_share
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.job import Job
 from mbtf_pipeline.tables import estimate
 
 # Raised when the method of measuring changes: older measurements are then repeated.
 SCHEMA = 11
-FOLDER = "measurements"
+# In the folder of a study: measurements, the generator's configuration, and temporary data and fits.
+FOLDER, CONFIG_NAME, WORK = "measurements", "generate.yaml", ".work"
+# About as many configurations of the generator share its time.
+_CONFIGURATIONS = 35
 # Relative half-width of a 95% interval that a study aims at, and that half-width over the standard error.
 HALF_WIDTH = 0.1
 NORMAL = 1.96
@@ -49,6 +54,14 @@ class Conditions:
     folder: Path
     seconds: float
     command: str
+
+    @classmethod
+    def of(cls, job: Job, folder: Path, seconds: float) -> Conditions:
+        """Of a study in a folder, whose comparisons of the generator take about so many seconds."""
+        config = job.config
+        command = shlex.join(["mbtf-gen", config.material, "--config", str(folder / CONFIG_NAME)])
+        basis, each = config.hash(job.material.digests), 0.5 * seconds / _CONFIGURATIONS
+        return cls(config.model_dump_json(), basis, folder / WORK, each, command)
 
     @cached_property
     def config(self) -> GeneratorConfig:

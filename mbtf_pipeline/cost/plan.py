@@ -11,11 +11,10 @@ from mbtf_core.units import clock, expectation, rounded_duration
 from mbtf_gen.forecast import forecast
 from mbtf_gen.job import Job
 from mbtf_pipeline.cost.answers import FARTHEST
-from mbtf_pipeline.cost.conditions import conditions_of, generator_seconds, study_config
-from mbtf_pipeline.cost.measurement import MeasurementFolder
-from mbtf_pipeline.cost.runs import LEAST_SECONDS, disk_bytes
-from mbtf_pipeline.cost.schedule import Measurements
-from mbtf_pipeline.cost.study import STUDY, no_run
+from mbtf_pipeline.cost.measurement import Conditions, MeasurementFolder
+from mbtf_pipeline.cost.runs import GENERATOR, LEAST_SECONDS, disk_bytes
+from mbtf_pipeline.cost.schedule import Measurements, generator_seconds
+from mbtf_pipeline.cost.study import STUDY, no_run, study_config
 from mbtf_pipeline.recipe import Recipe
 
 # Paths of the reference and of the generator's rate, which come before runs.
@@ -100,7 +99,7 @@ def plan_study(recipe: Recipe, folder: Path, *, seconds: float, seed: int | None
     # Alone, as each pilot takes all processors.
     share = processor_share()
     spp, pilot = job.config.queries.spp, forecast(job, seconds=1.0)
-    conditions = conditions_of(job, folder, seconds)
+    conditions = Conditions.of(job, folder, GENERATOR * seconds)
     found = Measurements(conditions, MeasurementFolder(folder, conditions), Runner(), share=share)
     if not found.recall_rate(spp):
         found.path_seconds = pilot.query_seconds / spp

@@ -190,16 +190,6 @@ class Measurements:
         runs = planned_runs(0.0, spp, self.path_seconds)
         return None if self._besides else self._study_seconds(runs, setup)
 
-    def seconds_for(self, work: float, *, spp: int, setup: float, seconds: float) -> float:
-        """Likewise of one of at least `seconds` whose longest run generates and trains for `work` seconds."""
-        while True:
-            missing = []
-            for run in self.plan_runs(seconds, spp):
-                missing += [] if self.recall(run) else [run]
-                if run.planned_seconds(self.path_seconds, self.step_seconds) >= work:
-                    return max(seconds, self._study_seconds(missing, setup))
-            seconds *= 1.1
-
     def _study_seconds(self, runs: Sequence[Run], setup: float) -> float:
         """Seconds of a study that has time for some runs, and makes the test set anew."""
         planned = (run.planned_seconds(self.path_seconds, self.step_seconds) for run in runs)
@@ -238,6 +228,11 @@ class Measurements:
                 return own == run.seed < seeds and NORMAL * deviation / math.sqrt(own) > HALF_WIDTH
 
             self.measure(missing([replace(run, seed=seed) for run in first], wide), independent=True)
+
+
+def generator_seconds(seconds: float) -> float:
+    """Time for comparisons of the generator: a share of what a study has beyond the least that forecasts."""
+    return GENERATOR * max(0.0, seconds - LEAST_SECONDS)
 
 
 def _step_seconds(run: Measurement) -> float:

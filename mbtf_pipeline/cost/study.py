@@ -11,7 +11,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -21,29 +21,26 @@ from mbtf_core.files.atomic import read_json
 from mbtf_core.files.editable import write_document
 from mbtf_core.files.folders import ELSEWHERE, OutputKind, check_space, owned
 from mbtf_core.run.runner import Runner
-from mbtf_core.run.task import Item
+from mbtf_core.run.task import Item, worker_threads
 from mbtf_core.stats import Estimate
-from mbtf_core.units import clock, expectation, format_duration, rounded_duration
+from mbtf_core.units import expectation, format_duration, rounded_duration
+from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_pipeline.cost.answers import FARTHEST, Evidence, is_significant
-from mbtf_pipeline.cost.conditions import (
-    CONFIG_NAME,
-    conditions_of,
-    generator_seconds,
-    measuring_machine,
-    study_config,
-)
+from mbtf_pipeline.cost.answers import Evidence, is_significant
 from mbtf_pipeline.cost.generator import benchmark_of
 from mbtf_pipeline.cost.measurement import (
+    CONFIG_NAME,
+    Conditions,
     Configuration,
     Measurement,
     MeasurementFolder,
     combined,
     seed_deviation,
 )
-from mbtf_pipeline.cost.runs import FEWEST_TOTALS, MOST_SEEDS, Run, disk_bytes, test_set
-from mbtf_pipeline.cost.schedule import COMPILING, RESUMES, Measurements
+from mbtf_pipeline.cost.runs import FEWEST_TOTALS, GENERATOR, MOST_SEEDS, Run, disk_bytes, test_set
+from mbtf_pipeline.cost.schedule import COMPILING, RESUMES, Measurements, generator_seconds
 from mbtf_pipeline.recipe import Recipe
+from mbtf_pipeline.stages import machine
 
 STUDY = OutputKind("study.json", "mbtf-cost", 2, "a cost study")
 
@@ -67,8 +64,6 @@ class Study:
     # Seconds of a study that measures a run, and of one that forecasts; None where this one does.
     least_run: float | None = None
     least: float | None = None
-    # Seconds of a study whose longest run takes so many of generating and training.
-    seconds_for: Callable[[float], float] | None = None
 
     @cached_property
     def evidence(self) -> Evidence:
@@ -77,14 +72,9 @@ class Study:
 
     @property
     def more(self) -> str:
-        """Which longer study would measure a run, forecast, or forecast longer times, in one sentence."""
+        """Which longer study would measure a run, or forecast, in one sentence; empty where this one does."""
         if self.least is None:
-            found = self.evidence
-            if self.seconds_for is None or found.curve is None or (target := found.next_time) is None:
-                return ""
-            longer = rounded_duration(self.seconds_for((target - found.overhead) / FARTHEST))
-            ends, reaches = clock(found.farthest), format_duration(target)
-            return f"the forecast ends at {ends}: repeat the command with --time {longer} to reach {reaches}"
+            return ""
         if self.least_run is not None:
             return no_run(self.least_run, self.least)
         runs = [m for m in self.measurements if m.study == "run"]
@@ -94,6 +84,23 @@ class Study:
         enough = self.least <= self.description["time"]
         how = "the same command" if enough else f"the command with --time {rounded_duration(self.least)}"
         return f"too few complete runs for a forecast: repeat {how}; it keeps these runs and adds others"
+
+
+def study_config(config: GeneratorConfig, seed: int | None) -> GeneratorConfig:
+    """A recipe's generator as its study uses it: without a target error, which would override the numbers of
+    paths, and with shuffled queries that share no paths."""
+    own = {"target_error": None, "layout": "shuffled", "lights_per_path": 1}
+    queries = config.queries.model_copy(update=own)
+    seeds = {} if seed is None else {"seed": seed}
+    return config.model_copy(update={"queries": queries, **seeds})
+
+
+def measuring_machine() -> dict[str, str]:
+    """Record of the machine that runs it; a task."""
+    found = machine()
+    if (threads := worker_threads()) is not None:
+        found["system"] += f", workers of {threads} thread{'s' * (threads != 1)}"
+    return found
 
 
 def claim(folder: Path, on: Mapping[str, str]) -> None:
@@ -182,7 +189,7 @@ def run_study(
         if there.error:
             raise PartialError(f"no worker answers: {there.error}", hint=there.hint or RESUMES)
         claim(folder, there.value)
-        conditions = conditions_of(job, folder, seconds)
+        conditions = Conditions.of(job, folder, GENERATOR * seconds)
         note("reference, which compiles the kernels")
         # Before anything is written: a refused study leaves the folder as it was.
         benchmark_of(conditions).check_variation()
@@ -249,5 +256,4 @@ def run_study(
         [f"{label}: {why}" for label, why in failed.items()],
         least_run=measurements.least_run_seconds(spp, setup),
         least=measurements.least_seconds(spp, setup),
-        seconds_for=partial(measurements.seconds_for, spp=spp, setup=setup, seconds=seconds),
     )

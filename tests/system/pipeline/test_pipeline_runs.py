@@ -179,7 +179,7 @@ def test_a_cost_study_measures_reports_and_resumes(
     )
     monkeypatch.setattr(schedule, "planned_runs", lambda *arguments: planned_runs(30.0, *arguments[1:])[:1])
     monkeypatch.setattr(schedule.Measurements, "fits", lambda *_: runs > 0)
-    monkeypatch.setattr("mbtf_pipeline.cost.conditions._CONFIGURATIONS", 1000)
+    monkeypatch.setattr("mbtf_pipeline.cost.measurement._CONFIGURATIONS", 1000)
     monkeypatch.setattr("mbtf_pipeline.cost.runs.SHORTEST", 4.0)
     monkeypatch.setattr("mbtf_pipeline.cost.runs.FEWEST_STEPS", 2)
     monkeypatch.setattr("mbtf_pipeline.cost.runs.TEST", (16384, 32))

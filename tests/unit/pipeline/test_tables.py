@@ -14,7 +14,7 @@ def test_values_within_two_error_bars_are_marked() -> None:
         text = estimate_text(Estimate(value, 0.02, 100))
         assert text.startswith("not significant (")
         assert "± 0.02" in text
-    assert estimate_text(Estimate(0.123, 0.004, 100), 100.0, "%") == "12.3 ± 0.4%"
+    assert estimate_text(Estimate(0.123, 0.004, 100), 100.0) == "12.3 ± 0.4"
     assert estimate_text(Estimate(-0.123, 0.004, 100)) == "−0.123 ± 0.004"
     assert estimate_text(Estimate(math.nan, math.inf, 1)) == "undefined"
 

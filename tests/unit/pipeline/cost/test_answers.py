@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.cost.answers import Evidence
 from mbtf_pipeline.cost.measurement import Measurement, combined, seed_deviation
-from mbtf_pipeline.cost.study import Study
 
 SECONDS = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0)
 
@@ -56,13 +54,6 @@ def test_a_study_forecasts_times_and_errors() -> None:
     # The work of the longest run takes 313 s.
     assert "takes more than 20:59, where the forecast ends" in found.time_of(law(1900.0))
     assert found.error_after(1300.0) is None
-
-
-def test_a_study_states_where_its_forecast_ends() -> None:
-    found = evidence(SECONDS[:3])
-    study = Study(Path(), {}, list(found.runs), found.deviation, seconds_for=lambda work: 10 * work)
-    # 7 s, and four times the 33 s of the longest run; a quarter of 293 s needs ten times as long.
-    assert study.more == "the forecast ends at 2:19: repeat the command with --time 13min to reach 5min"
 
 
 def test_forecasts_of_short_studies_contain_the_truth() -> None:

@@ -105,18 +105,6 @@ def test_the_time_of_a_study_counts_its_test_set_once_and_the_generator() -> Non
     assert least == pytest.approx(needed + COMPILING * GENERATOR * (least - LEAST_SECONDS))
 
 
-def test_a_longer_study_has_time_for_a_longer_run() -> None:
-    found = Measurements(conditions(), MemoryStore(), Runner(), path_seconds=1e-6, step_seconds=0.02)  # type: ignore[arg-type]
-    enough = found.seconds_for(72.0, spp=4, setup=10.0, seconds=120.0)
-
-    def longest(seconds: float) -> float:
-        before = 10.0 + COMPILING * GENERATOR * (seconds - LEAST_SECONDS)
-        runs, _ = found.fitting(found.plan_runs(seconds, 4), before, seconds)
-        return max(r.planned_seconds(found.path_seconds, found.step_seconds) for r in runs)
-
-    assert longest(1.01 * enough) >= 72.0 > longest(0.8 * enough)
-
-
 RUNS = [run(3000, "long", 7200.0), run(2000, "short", 60.0), run(1000, "m", 40.0)]
 
 
