@@ -34,30 +34,15 @@ def has_extra(module: str) -> bool:
 
 
 def extra_error(module: str, where: object, fault: str = "is not installed") -> EngineError:
-    """The error that says which extra to install.
-
-    Parameters
-    ----------
-    module : of the table
-    where : file, option or key that needs it
-    fault : what is wrong with it
-    """
+    """The error that says which extra installs a module of the table; `where` (file, option or key) needs it,
+    `fault` is wrong with it."""
     extra, distribution = EXTRAS[module]
     return EngineError(f"{distribution} {fault}", where=where, hint=f"pip install 'mbtf[{extra}]'")
 
 
 def import_extra(name: str, where: object) -> Any:
-    """Import a module of the table, or one inside it.
-
-    Parameters
-    ----------
-    name : with dots where it lies inside
-    where : file, option or key that needs it
-
-    Raises
-    ------
-    EngineError : it is not installed, or cannot be imported
-    """
+    """Import a module of the table, or one inside it, with dots; an EngineError that names `where` (file,
+    option or key) if it is not installed, or cannot be imported."""
     top = name.partition(".")[0]
     try:
         return import_module(name)

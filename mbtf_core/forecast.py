@@ -27,18 +27,8 @@ INSUFFICIENT = "the evidence does not suffice"
 
 
 def pilot_seconds(piece: Callable[[int], float], seconds: float) -> Estimate:
-    """Seconds of one unit of work, from timed pieces of it.
-
-    Parameters
-    ----------
-    piece : does the piece of this number, from 1; returns how many units of work it was
-    seconds : time for all pieces, in seconds; three are timed at least
-
-    Returns
-    -------
-    Estimate
-        Median over the pieces, in seconds per unit.
-    """
+    """Seconds of one unit of work: the median over timed pieces of it, for so many seconds and three at
+    least. ``piece(number)``, from 1, does a piece and returns how many units of work it was."""
     times: list[float] = []
     began = time.perf_counter()
     while len(times) < FEWEST_PIECES or time.perf_counter() - began < seconds:
@@ -49,17 +39,8 @@ def pilot_seconds(piece: Callable[[int], float], seconds: float) -> Estimate:
 
 
 def median_estimate(times: Sequence[float]) -> Estimate:
-    """Median of timings, which other work on the machine changes little.
-
-    Parameters
-    ----------
-    times : in seconds
-
-    Returns
-    -------
-    Estimate
-        Its standard error follows from the median absolute deviation, as for a normal distribution.
-    """
+    """Median of timings in seconds, which other work on the machine changes little. Its standard error
+    follows from the median absolute deviation, as for a normal distribution."""
     middle = float(np.median(times))
     deviation = 1.4826 * float(np.median(np.abs(np.asarray(times) - middle)))
     return Estimate(middle, 1.2533 * deviation / math.sqrt(len(times)), len(times))
@@ -87,14 +68,7 @@ def is_long(seconds: float, size: float) -> bool:
 
 
 def expected_error(seconds: float, error: Interval) -> str:
-    """What a time is expected to give, in one line.
-
-    Parameters
-    ----------
-    seconds : float
-    error : Interval
-        Unexplained variance.
-    """
+    """What a time is expected to give, in one line; `error` is an unexplained variance."""
     if error.suffices:
         return f"{clock(seconds)}: expect an unexplained variance of {error}"
     return f"{clock(seconds)}: {INSUFFICIENT}"
@@ -103,19 +77,9 @@ def expected_error(seconds: float, error: Interval) -> str:
 def expected_seconds(
     error: float, seconds: Interval, limit: Interval, why: str, *, within: float = math.inf
 ) -> str:
-    """How long an error is expected to take, in one line.
-
-    Parameters
-    ----------
-    error : float
-        Unexplained variance.
-    seconds, limit : Interval
-        Time that reaches it, and error that no time undercuts.
-    why : str
-        What limits the error, such as ``with these queries``.
-    within : float
-        Time whose error is at most this one even at its upper bound; infinite where none is known.
-    """
+    """How long an error is expected to take, in one line: the time that reaches an unexplained variance, the
+    limit that no time undercuts, and why, such as ``with these queries``. `within` is a time whose error is
+    at most this one even at its upper bound; infinite where none is known."""
     if seconds.suffices:
         span = f"{clock(seconds.low)} to {clock(seconds.high)}"
         return f"error {error:g}: about {clock(seconds.value)} ({span})"

@@ -118,12 +118,8 @@ def lock_owner(path: Path) -> str | None:
 
 
 def take_lock(path: Path) -> Lock | None:
-    """Acquire the lock of the shard `path`; None when another writer owns it.
-
-    Raises
-    ------
-    PartialError : the folder cannot be written
-    """
+    """Acquire the lock of the shard `path`; None when another writer owns it, a PartialError where the folder
+    cannot be written."""
     file = lock_file_of(path)
     owner = json.dumps({"host": socket.gethostname(), "process": os.getpid(), "since": time.time()})
     if not _has_locks(file.parent):
@@ -184,12 +180,8 @@ def shard_lock(path: Path) -> Iterator[bool]:
 
 @contextlib.contextmanager
 def brief_lock(path: Path) -> Iterator[None]:
-    """Acquire a lock that is only used briefly, such as the manifest's, and wait for it if needed.
-
-    Raises
-    ------
-    PartialError : another process does not release it
-    """
+    """Acquire a lock that is only used briefly, such as the manifest's, and wait for it if needed; a
+    PartialError where another process does not release it."""
     give_up = time.monotonic() + _PATIENCE_SECONDS
     while (lock := take_lock(path)) is None:
         if time.monotonic() > give_up:

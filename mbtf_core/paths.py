@@ -24,11 +24,7 @@ def suggest_path(path: Path, wanted: Callable[[Path], bool] | None = None) -> st
     """``did you mean 'rock/height.png'?`` for a path that does not exist; empty where no name is similar.
 
     The first part of the path that does not exist is compared, without regard to case, with what lies beside
-    it; a file of the same stem and another suffix is suggested too.
-
-    Parameters
-    ----------
-    wanted : which neighbors may be suggested; all by default
+    it and is `wanted`; a file of the same stem and another suffix is suggested too.
     """
     parts = [path, *path.parents]
     missing = next((p for p in reversed(parts) if not p.exists()), None)
@@ -73,12 +69,7 @@ def suggest_name(given: str, known: Sequence[str], least: float = _LEAST) -> str
 
 
 def refuse_special(path: Path) -> None:
-    """Refuse a pipe, a socket or a device, whose content may never end; a missing file passes.
-
-    Raises
-    ------
-    InputError : it is one
-    """
+    """Refuse a pipe, a socket or a device, whose content may never end; a missing file passes."""
     try:
         kind = _SPECIAL.get(stat.S_IFMT(path.stat().st_mode))
     except (OSError, ValueError):

@@ -45,17 +45,8 @@ PNG_BYTES = 3
 
 
 def pixel_sigma(area: Any) -> Any:
-    """Footprint σ of a pixel: the geometric mean of the two radii of its projected Gaussian.
-
-    Parameters
-    ----------
-    area : area of the pixel on the surface, in squared tile widths
-
-    Returns
-    -------
-    float, array or Float
-        σ in tile widths.
-    """
+    """Footprint σ of a pixel in tile widths: the geometric mean of the two radii of its projected Gaussian,
+    by the area of the pixel on the surface in squared tile widths (float, array or Float)."""
     return PIXEL_SIGMA * area**0.5
 
 
@@ -162,15 +153,9 @@ class Camera:
 def tiles_camera(
     elevation: float, azimuth: float, *, tiles: int, aspect: float, displacement_range: float, columns: int
 ) -> Camera:
-    """Camera that looks at the center of `tiles` × `tiles` tiles and just fits them.
-
-    Parameters
-    ----------
-    elevation, azimuth : direction towards the camera, in degrees
-    aspect : H/W of the tile
-    displacement_range : largest depth of the tile, in tile widths
-    columns : pixels across; pictures are 4:3
-    """
+    """Camera that looks at the center of `tiles` × `tiles` tiles of H/W `aspect` and just fits them; pictures
+    are 4:3. Elevation and azimuth are those towards the camera, in degrees; the displacement range is the
+    largest depth of the tile, in tile widths."""
     x, y = 0.5 * tiles, 0.5 * tiles * aspect
     rows = max(1, round(_PROPORTION * columns))
     camera = Camera(elevation, azimuth, 1.0, (x, y), rows, columns)
@@ -238,20 +223,12 @@ def claim_pictures(
     inputs: Mapping[str, str],
     overwrite: bool = False,
 ) -> OutputFolder:
-    """Claim a folder for the pictures of a command; the caller owns it.
+    """Claim a folder for the pictures of a command, such as ``mbtf-gen reference``; the caller owns it.
 
-    Parameters
-    ----------
-    command : such as ``mbtf-gen reference``
-    files : names of all files that may be written
-    config : resolved options, written beside the pictures; ``material`` and ``exposure`` do not determine
-        their content, the others do
-    inputs : digests of the input files by role, which determine it as well
-    overwrite : remove what the folder's record lists, and start anew
-
-    Raises
-    ------
-    InputError : the folder holds something else
+    `files` are names of all files that may be written. Resolved options are written beside the pictures; all
+    but ``material`` and ``exposure`` determine their content, and so do the digests of the input files by
+    role. An InputError where the folder holds something else. To overwrite is to remove what its record
+    lists.
     """
     depends = {key: value for key, value in config.items() if key not in _DISPLAY}
     return OutputFolder.claim(
@@ -265,20 +242,8 @@ def claim_pictures(
 
 
 def read_references(folder: Path) -> list[tuple[NDArray[np.float32], Camera, NDArray[np.float32]]]:
-    """Value in 1/sr, camera, and direction of the light of the finished pictures of ``mbtf-gen reference``.
-
-    Parameters
-    ----------
-    folder : output folder of the command
-
-    Returns
-    -------
-    list of (array (rows, columns, 3), Camera, array (3,))
-
-    Raises
-    ------
-    InputError : the folder has no such pictures
-    """
+    """Value (rows, columns, 3) in 1/sr, camera, and direction (3,) of the light of the finished pictures in
+    an output folder of ``mbtf-gen reference``; an InputError where it has none."""
     known = pictures_of("mbtf-gen reference").read(folder)
     if known is None:
         hint = suggest_path(folder, Path.is_dir)

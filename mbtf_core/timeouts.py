@@ -15,15 +15,11 @@ class NoAnswer(TimeoutError):
 
 
 def call_within(seconds: float, function: Callable[[], T]) -> T:
-    """Result of a call, which runs in a thread of its own.
+    """Result of a call, or its error, which runs in a thread of its own; :class:`NoAnswer` where it has not
+    returned in time.
 
     A call that exceeds its time goes on in its thread, which does not delay the exit. While this process is
     stopped, as by Ctrl-Z, the time does not count.
-
-    Raises
-    ------
-    NoAnswer : the call has not returned in time
-    the errors of `function`
     """
     results: list[T] = []
     errors: list[BaseException] = []

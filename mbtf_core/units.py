@@ -29,12 +29,8 @@ def _format(number: float, units: Mapping[str, float], default: str) -> str:
 
 
 def parse_duration(text: str | float) -> float:
-    """Seconds of ``"90s"``, ``"2min"``, ``"1.5h"``, or of a plain number of seconds.
-
-    Raises
-    ------
-    ValueError : none of these, or not positive
-    """
+    """Seconds of ``"90s"``, ``"2min"``, ``"1.5h"``, or of a plain number of seconds; a ValueError for others,
+    and for those not positive."""
     seconds = _parse(text, _SECONDS, "a duration such as 90s, 2min or 1h")
     if not 0 < seconds <= 1e7:
         raise ValueError("must be a positive duration of at most 1e7 seconds")
@@ -42,12 +38,8 @@ def parse_duration(text: str | float) -> float:
 
 
 def asked_duration(text: str, flag: str) -> float:
-    """Seconds of a duration given with a flag of the command line.
-
-    Raises
-    ------
-    UsageError : it is none; names the flag
-    """
+    """Seconds of a duration given with a flag of the command line, which the UsageError names where it is
+    none."""
     try:
         return parse_duration(text)
     except ValueError as error:
@@ -66,12 +58,8 @@ def rounded_duration(seconds: float) -> str:
 
 
 def parse_size(text: str | float) -> float:
-    """Bytes of ``"500MB"``, ``"4GB"``, or of a plain number of bytes; decimal units.
-
-    Raises
-    ------
-    ValueError : none of these, or not positive
-    """
+    """Bytes of ``"500MB"``, ``"4GB"``, or of a plain number of bytes, decimal units; a ValueError for others,
+    and for those not positive."""
     size = _parse(text, _BYTES, "an amount of memory such as 500MB or 4GB")
     if not 0 < size <= 1e18:
         raise ValueError("must be a positive amount of memory")
@@ -112,12 +100,7 @@ Size = Annotated[float, BeforeValidator(parse_size), PlainSerializer(format_size
 
 
 def parse_numbers(value: Any) -> Any:
-    """Numbers of a text such as ``"1,2,4"``; any other value as it is.
-
-    Raises
-    ------
-    ValueError : a text that is none
-    """
+    """Numbers of a text such as ``"1,2,4"``, a ValueError where it is none; any other value as it is."""
     if not isinstance(value, str):
         return value
     try:

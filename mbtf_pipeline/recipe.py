@@ -196,11 +196,7 @@ def _move_paths(data: Any, moved: Callable[[str], object]) -> None:
 
 def read_recipe(path: Path) -> Any:
     """Data of a recipe of any kind; its paths, relative to its file, are made relative to the current folder.
-
-    Raises
-    ------
-    InputError : the file cannot be read
-    """
+    An InputError where the file cannot be read."""
     data = read_yaml(path)
     _move_paths(data, partial(named_file, path.parent))
     return data
@@ -254,17 +250,9 @@ def load_recipe(
 def quality_options(
     path: Path, quality: Quality | None, assignments: Sequence[str] = (), training: float | None = None
 ) -> dict[str, Any]:
-    """Options, by dotted key, that apply a preset to the recipe of a file.
-
-    Parameters
-    ----------
-    assignments : ``a.b=c`` that will override them
-    training : seconds of training that decide the networks; the preset's by default
-
-    Raises
-    ------
-    InputError : the file cannot be read
-    """
+    """Options, by dotted key, that apply a preset to the recipe of a file, where ``a.b=c`` will override
+    them; an InputError where the file cannot be read. Seconds of training decide the networks, by default the
+    preset's."""
     if quality is None:
         return {}
     given = explicit_options(path, assignments, read_recipe)
@@ -283,18 +271,9 @@ def quality_options(
 def preset_recipe(
     path: Path, quality: Quality | None, assignments: Sequence[str] = (), training: float | None = None
 ) -> Recipe:
-    """The recipe of a file at a quality preset.
-
-    Parameters
-    ----------
-    assignments : ``a.b=c``, which override the preset
-    training : as in :func:`quality_options`
-
-    Raises
-    ------
-    InputError : file or material cannot be read
-    UsageError : an assignment is invalid
-    """
+    """The recipe of a file at a quality preset, which ``a.b=c`` override; `training` is as in
+    :func:`quality_options`. An InputError where file or material cannot be read, a UsageError where an
+    assignment is invalid."""
     preset = quality_options(path, quality, assignments, training)
     recipe = load_recipe(path, assignments, presets=preset)
     if f"generate.{RESOLUTION}" not in preset:
@@ -312,12 +291,8 @@ def with_training(recipe: Recipe, **options: Any) -> Recipe:
 
 
 def write_recipe(recipe: Recipe, folder: Path, *, overwrite: bool = False) -> None:
-    """Write the resolved recipe into a run's folder; it can be run again from there.
-
-    Raises
-    ------
-    InputError : there is one that has been edited, unless it is to be overwritten
-    """
+    """Write the resolved recipe into a run's folder; it can be run again from there. An InputError where
+    there is one that has been edited, unless it is to be overwritten."""
     from mbtf_core.files.editable import write_document
 
     data = recipe.model_dump(mode="json")
@@ -326,13 +301,8 @@ def write_recipe(recipe: Recipe, folder: Path, *, overwrite: bool = False) -> No
 
 
 def read_resolved(folder: Path) -> Recipe:
-    """The resolved recipe of a run's folder; its material may be missing, and the code of its models is
-    neither needed nor run.
-
-    Raises
-    ------
-    InputError : the folder contains no run
-    """
+    """The resolved recipe of a run's folder, an InputError where it contains no run; its material may be
+    missing, and the code of its models is neither needed nor run."""
     path = folder / RECIPE_NAME
     if not path.exists():
         hint = "create one: mbtf-pipeline run RECIPE -o FOLDER"

@@ -137,12 +137,8 @@ class RunForecaster:
 
 def forecast_left(recipe: Recipe, folder: Path, draft: Callable[[], Recipe]) -> str | None:
     """Forecast of the stages that a run in a folder has yet to do, as a line with faster options: `draft`
-    makes the recipe of that preset. None where they are short and small on any machine.
-
-    Raises
-    ------
-    InputError : they do not fit on the disk, or the folder contains something else
-    """
+    makes the recipe of that preset. None where they are short and small on any machine; an InputError where
+    they do not fit on the disk, or the folder contains something else."""
     RUN.check(folder)
     stages = [name for name, reason in survey(recipe, folder).items() if reason]
     forecaster = RunForecaster(recipe)

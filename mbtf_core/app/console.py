@@ -224,12 +224,7 @@ def _library_warnings(shown: bool) -> Iterator[None]:
 
 
 def _check_tokens(tokens: Sequence[str]) -> None:
-    """Refuse empty arguments, which paths would take as the current folder, and those that are not text.
-
-    Raises
-    ------
-    UsageError : there is one
-    """
+    """Refuse empty arguments, which paths would take as the current folder, and those that are not text."""
     for before, token in zip(("", *tokens), tokens, strict=False):
         if token in ("", "--output=", "-o="):
             where = (token or before).rstrip("=")

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import os
 import shlex
-import types
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, make_dataclass, replace
@@ -33,7 +32,7 @@ from pydantic import BaseModel, TypeAdapter
 from pydantic.fields import FieldInfo
 
 from mbtf_core.app.help import MORE
-from mbtf_core.config.settings import Settings, explicit_options, resolve
+from mbtf_core.config.settings import Settings, explicit_options, parts_of, resolve
 from mbtf_core.errors import UsageError
 from mbtf_core.paths import split_url
 
@@ -53,12 +52,8 @@ Switch = Annotated[bool, Parameter(negative="", show_default=False)]
 
 
 def whole_number(kind: object, tokens: Sequence[Token]) -> int:
-    """Converter of options outside configurations: cyclopts itself rounds 8.5 to 8.
-
-    Raises
-    ------
-    ValueError : no whole number
-    """
+    """Converter of options outside configurations, a ValueError for other numbers: cyclopts itself rounds 8.5
+    to 8."""
     return int(tokens[0].value)
 
 
@@ -88,12 +83,7 @@ ErrorOption = Annotated[
 
 
 def check_error(error: float | None) -> None:
-    """Refuse an ``--error`` that is no unexplained variance below that of the mean value.
-
-    Raises
-    ------
-    UsageError : it is not in (0, 1]
-    """
+    """Refuse an ``--error`` that is no unexplained variance in (0, 1], below that of the mean value."""
     if error is not None and not 0 < error <= 1:
         raise UsageError("must be above 0 and at most 1, the error of the mean value", where="--error")
 
@@ -189,12 +179,8 @@ class ConfigOption:
 
 
 def config_options(model: type[BaseModel], *keys: str) -> list[ConfigOption]:
-    """Options of a configuration in its own order.
-
-    Parameters
-    ----------
-    keys : dotted keys, of options or of whole sections; all by default
-    """
+    """Options of a configuration in its own order: those of dotted keys, of options or of whole sections; all
+    by default."""
     found = list(_walk(model, ""))
     if not keys:
         return found
@@ -212,8 +198,8 @@ def _walk(model: type[BaseModel], prefix: str) -> Iterator[ConfigOption]:
 
 def _option(flag: Flag, key: str, field: FieldInfo) -> ConfigOption:
     text, _, default = (field.description or "").partition(_DEFAULT)
-    kind = _bare(field.annotation)
-    parts = typing.get_args(kind) if typing.get_origin(kind) is Union else (kind,)
+    parts = [part for part in parts_of(field.annotation, containers=False) if part is not type(None)]
+    kind: Any = parts[0] if len(parts) == 1 else Union[tuple(parts)]  # noqa: UP007
     choices = any(typing.get_origin(part) is Literal for part in parts) and flag.metavar is None
     return ConfigOption(
         flag.name,
@@ -225,16 +211,6 @@ def _option(flag: Flag, key: str, field: FieldInfo) -> ConfigOption:
         typing.get_origin(kind) is list or (isinstance(kind, type) and issubclass(kind, BaseModel)),
         flag.rare,
     )
-
-
-def _bare(annotation: Any) -> Any:
-    """A type without None and metadata."""
-    if typing.get_origin(annotation) is Annotated:
-        return _bare(typing.get_args(annotation)[0])
-    if typing.get_origin(annotation) in (Union, types.UnionType):
-        kept = [part for part in typing.get_args(annotation) if part is not type(None)]
-        return _bare(kept[0]) if len(kept) == 1 else annotation
-    return annotation
 
 
 def _default_text(field: FieldInfo) -> str:
@@ -352,13 +328,8 @@ def options_from(model: type[BaseModel], *keys: str) -> Callable[[type[C]], type
 
 
 def command_line(*words: object, **options: Any) -> str:
-    """A command as a shell takes it, for records.
-
-    Parameters
-    ----------
-    words : program, command, positional arguments
-    options : by parameter's name; None, False and empty lists are left out, `output` becomes ``-o``
-    """
+    """A command as a shell takes it, for records: its words, and options by parameter's name. None, False and
+    empty lists are left out, `output` becomes ``-o``."""
     line = [str(word) for word in words]
     for name, value in options.items():
         flag = "-o" if name == "output" else f"--{name.replace('_', '-')}"

@@ -230,12 +230,8 @@ def build(
 
 
 def check_schema(document: Mapping[str, Any], version: int, where: object, hint: str) -> None:
-    """Refuse a JSON document of the programs that another version of them wrote.
-
-    Raises
-    ------
-    InputError : with both schema versions
-    """
+    """Refuse a JSON document of the programs that another version of them wrote, with both schema
+    versions."""
     found = document.get("schema")
     if found != version:
         what = f"has schema version {found}, this program reads version {version}"
@@ -243,12 +239,8 @@ def check_schema(document: Mapping[str, Any], version: int, where: object, hint:
 
 
 def check_document(model: type[B], data: Mapping[str, Any], path: object, hint: str) -> B:
-    """A JSON document of the programs as `model`.
-
-    Raises
-    ------
-    InputError : with the first key that is missing or holds something else
-    """
+    """A JSON document of the programs as `model`; an InputError with the first key that is missing or holds
+    something else."""
     try:
         return build(model, data, source=str(path))
     except InputError as error:
@@ -256,12 +248,7 @@ def check_document(model: type[B], data: Mapping[str, Any], path: object, hint: 
 
 
 def parse_assignment(text: str) -> tuple[str, Any]:
-    """(dotted key, value) of ``a.b=c``.
-
-    Raises
-    ------
-    UsageError : it has another form
-    """
+    """(dotted key, value) of ``a.b=c``; a UsageError for another form."""
     key, sign, value = text.partition("=")
     if not sign or not key.strip():
         raise UsageError(f"{shortened(text)} is not of the form key=value", where="--set")
@@ -292,13 +279,8 @@ def _contradiction(model: type[Settings], data: Mapping[str, Any]) -> tuple[str,
 
 
 def explicit_options(file: Path | None, assignments: Sequence[str], read: Read = read_yaml) -> dict[str, Any]:
-    """Options of a configuration file and of ``a.b=c``, nested; single values of the latter as text.
-
-    Raises
-    ------
-    InputError : the file cannot be read
-    UsageError : an assignment has another form
-    """
+    """Options of a configuration file and of ``a.b=c``, nested; single values of the latter as text. An
+    InputError where the file cannot be read, a UsageError for an assignment of another form."""
     given = {} if file is None else dict(read(file))
     for text in assignments:
         key, parsed = parse_assignment(text)

@@ -35,12 +35,8 @@ def _is_yaml(path: Path) -> bool:
 
 
 def read_yaml(path: Path) -> Any:
-    """Mapping stored in a YAML file, with line numbers kept.
-
-    Raises
-    ------
-    InputError : the file is missing, unreadable, not YAML, or not a mapping
-    """
+    """Mapping stored in a YAML file, with line numbers kept; an InputError where the file is missing,
+    unreadable, not YAML, or not a mapping."""
     from ruamel.yaml.error import MarkedYAMLError
     from ruamel.yaml.reader import ReaderError
 
@@ -83,12 +79,8 @@ def read_yaml(path: Path) -> Any:
 
 
 def _text_of(path: Path) -> str:
-    """Text of a file, at most about as much as is read of a configuration.
-
-    Raises
-    ------
-    InputError : the file is missing, unreadable or not UTF-8
-    """
+    """Text of a file, at most about as much as is read of a configuration; an InputError where it is missing,
+    unreadable or not UTF-8."""
     refuse_special(path)
     try:
         with path.open("rb") as stream:
@@ -124,13 +116,8 @@ def _deep_bracket(text: str) -> int | None:
 
 
 def _check_tree(data: Any, where: object) -> None:
-    """Refuse YAML that no configuration contains.
-
-    Raises
-    ------
-    InputError : nested too deeply, repeated through aliases (or holding itself), keys that are no text, or
-        tags of some program's own
-    """
+    """Refuse YAML that no configuration contains: nested too deeply, repeated through aliases (or holding
+    itself), keys that are no text, or tags of some program's own."""
     # Each value with its depth and the line of the last key on the way to it.
     waiting: list[tuple[Any, int, int | None]] = [(data, 1, None)]
     seen = 0

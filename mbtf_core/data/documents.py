@@ -186,12 +186,8 @@ def repair_hint(folder: object) -> str:
 
 
 def read_sidecar(folder: DataFolder, entry: ShardEntry, config_hash: str) -> dict[str, Any]:
-    """Sidecar of a finished shard, whose bytes are not read.
-
-    Raises
-    ------
-    InputError : the shard is not finished, has another size, or is not what the manifest lists
-    """
+    """Sidecar of a finished shard, whose bytes are not read; an InputError where the shard is not finished,
+    has another size, or is not what the manifest lists."""
     where, sidecar, size = folder.at(entry.file), sidecar_name(entry.file), folder.size(entry.file)
     for missing, fault in zip((size is None, not folder.has(sidecar)), ABSENT, strict=True):
         if missing:
@@ -226,16 +222,8 @@ def upload_waiting(
     folder: DataFolder, entries: Sequence[ShardEntry], config_hash: str, plan: str
 ) -> list[str]:
     """Upload the shards that earlier runs could not upload and that the data set lacks; returns their names.
-
-    Parameters
-    ----------
-    entries : all shards of the data set
-    config_hash, plan : digests of configuration and run plan that the shards must have
-
-    Raises
-    ------
-    PartialError : the store cannot be reached; the shards are kept
-    """
+    Shards must be among `entries`, and have these digests of configuration and run plan. A PartialError where
+    the store cannot be reached; the shards are kept."""
     known = {entry.file: entry for entry in entries}
 
     def is_lacking(record: dict[str, Any]) -> bool:

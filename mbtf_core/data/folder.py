@@ -187,17 +187,9 @@ class DataFolder:
         return parse_checksummed(self.read(name, hint), self.at(name), hint)
 
     def file(self, name: str, sha256: str, size: int | None = None) -> Path:
-        """A local file with the content of a shard or geometry. One that is downloaded has been checked.
-
-        Parameters
-        ----------
-        sha256, size : digest and size by sidecar or manifest; the size by default as listed
-
-        Raises
-        ------
-        InputError : it is missing, or has another digest
-        PartialError : the store cannot be reached, or the disk is full
-        """
+        """A local file with the content of a shard or geometry. One that is downloaded has been checked: an
+        InputError where it is missing, or has another digest than that by sidecar or manifest. Its size is by
+        default the listed one."""
         if self.local is not None:
             return self.local / name
         hint = f"check the data set with: mbtf-gen verify {self}"
@@ -243,12 +235,8 @@ class DataFolder:
         self._coming.discard((name, sha256))
 
     def write(self, name: str, content: bytes, *, new: bool = False) -> bool:
-        """Write a document whole; False where `new`, and another writer's is there.
-
-        Raises
-        ------
-        PartialError : the disk is full, or the store cannot be reached
-        """
+        """Write a document whole; False where `new`, and another writer's is there. A PartialError where the
+        disk is full, or the store cannot be reached."""
         if not self.store.write(name, content, new=new):
             return False
         self._keep(name, content, len(content))
@@ -322,13 +310,8 @@ class DataFolder:
         """Upload the whole shards that earlier runs on this machine could not upload, instead of rendering
         them again, and return their names; the others are removed.
 
-        Parameters
-        ----------
-        wanted : whether a shard with this sidecar belongs to the data set, which lacks it
-
-        Raises
-        ------
-        PartialError : the store cannot be reached; the shards are kept
+        `wanted` tells by its sidecar whether a shard belongs to the data set, which lacks it. A PartialError
+        where the store cannot be reached; the shards are kept.
         """
         sent: list[str] = []
         waiting = [] if self.local is not None else list(self.workspace.iterdir())
@@ -368,12 +351,8 @@ class DataFolder:
                     remove_unfinished(self.workspace, [*files, *(documents if stem == general else [])])
 
     def clear(self) -> None:
-        """Remove the data set and nothing else, the manifest last, so that shards never remain without it.
-
-        Raises
-        ------
-        PartialError : another process writes it, or a file cannot be removed
-        """
+        """Remove the data set and nothing else, the manifest last, so that shards never remain without it. A
+        PartialError where another process writes it, or a file cannot be removed."""
         with ExitStack() as held:
             for path in self._locks():
                 lock = take_lock(path)

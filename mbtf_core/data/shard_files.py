@@ -49,12 +49,8 @@ def row_bytes(holes: bool) -> int:
 def check_arrays(
     arrays: Mapping[str, NDArray[np.float32]], where: object, *, complete: bool = True
 ) -> tuple[int, ...]:
-    """Leading axes shared by arrays of a shard; by default, none of the required arrays may be missing.
-
-    Raises
-    ------
-    InputError : an array is missing, unknown, or of the wrong shape
-    """
+    """Leading axes shared by arrays of a shard; an InputError where an array is unknown, of the wrong shape
+    or, unless the shard need not be `complete`, missing."""
     missing = [a.name for a in ARRAYS if complete and not a.optional and a.name not in arrays]
     if missing:
         raise InputError(f"shard lacks the array(s) {', '.join(missing)}", where=where)
@@ -93,12 +89,8 @@ _SHARED = ("sigma", "omega_i", "omega_o", "weight")
 
 
 def check_values(arrays: Mapping[str, NDArray[np.float32]], where: object) -> None:
-    """Refuse numbers that the arrays of a shard cannot hold.
-
-    Raises
-    ------
-    InputError : with the array, the number of invalid elements, and the row of the first
-    """
+    """Refuse numbers that the arrays of a shard cannot hold, with the array, the number of invalid elements,
+    and the row of the first."""
     with np.errstate(all="ignore"):
         for name, array in arrays.items():
             valid, fault = _VALID[name]
@@ -167,12 +159,8 @@ def write_npz(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
 
 
 def read_npz(path: Path, names: Iterable[str] | None = None, *, mapped: bool = True) -> Arrays:
-    """Arrays of an npz shard, all or those in `names`, memory-mapped read-only by default.
-
-    Raises
-    ------
-    InputError : missing file, not a shard, truncated, or compressed by another writer
-    """
+    """Arrays of an npz shard, all or those in `names`, memory-mapped read-only by default; an InputError
+    where the file is missing, no shard, truncated, or compressed by another writer."""
     out: Arrays = {}
     try:
         with zipfile.ZipFile(path) as archive, path.open("rb") as stream:
@@ -246,12 +234,7 @@ def write_exr(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
 
 
 def read_exr(path: Path, names: Iterable[str] | None = None) -> Arrays:
-    """Arrays of an EXR shard.
-
-    Raises
-    ------
-    InputError : missing file, not an EXR file, or not a shard
-    """
+    """Arrays of an EXR shard; an InputError where the file is missing, no EXR file, or no shard."""
     from mbtf_core.images.exr import read_parts
 
     if not path.exists():

@@ -89,12 +89,8 @@ def document_faults(folder: DataFolder, manifest: Mapping[str, Any]) -> Iterator
 def shard_faults(
     folder: DataFolder, entries: Sequence[ShardEntry], config_hash: str, plan: str
 ) -> Iterator[Fault]:
-    """Faults of the listed shards, read by several threads.
-
-    Parameters
-    ----------
-    plan : digest of the run plan that all shards must have
-    """
+    """Faults of the listed shards, read by several threads; `plan` is the digest of the run plan that all
+    must have."""
     hint = repair_hint(folder)
     listed: set[str] = set()
     first: dict[str, str] = {}

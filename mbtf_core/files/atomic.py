@@ -36,12 +36,8 @@ class Stored:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make renames in `folder` durable (a no-op where folders cannot be opened or synced).
-
-    Raises
-    ------
-    OSError : the disk failed
-    """
+    """Make renames in `folder` durable (a no-op where folders cannot be opened or synced); an OSError where
+    the disk failed."""
     try:
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -85,12 +81,8 @@ def _replace(temporary: Path, path: Path) -> None:
 
 
 def write_file(path: Path, write: Callable[[BinaryIO], None]) -> None:
-    """Write `path` through `write(stream)` so that a crash at any instant leaves the old file or the new one.
-
-    Raises
-    ------
-    PartialError : the disk is full or the folder cannot be written
-    """
+    """Write `path` through `write(stream)` so that a crash at any instant leaves the old file or the new one;
+    a PartialError where the disk is full or the folder cannot be written."""
     with _temporary(path) as temporary:
         _fill(temporary, write)
         _replace(temporary, path)
@@ -104,12 +96,8 @@ def _fill(temporary: Path, write: Callable[[BinaryIO], object]) -> None:
 
 
 def write_chunks(path: Path, chunks: Iterable[Buffer]) -> Stored:
-    """Write `path` from consecutive pieces, atomically, and digest it on the way.
-
-    Raises
-    ------
-    PartialError : the disk is full or the folder cannot be written
-    """
+    """Write `path` from consecutive pieces, atomically, and digest it on the way; errors are those of
+    :func:`write_file`."""
     sha, size = hashlib.sha256(), 0
 
     def write(stream: BinaryIO) -> None:
@@ -139,14 +127,10 @@ def write_through(path: Path, write: Callable[[Path], None]) -> Stored:
 
 
 def create_file(path: Path, content: bytes) -> bool:
-    """Write a file unless it exists; False where it does.
+    """Write a file unless it exists; False where it does. Errors are those of :func:`write_file`.
 
     One of several writers succeeds, also across machines: a hard link names the file. On file systems without
     hard links there is a short window in which the last writer succeeds.
-
-    Raises
-    ------
-    PartialError : the disk is full or the folder cannot be written
     """
     with _temporary(path) as temporary:
         _fill(temporary, lambda stream: stream.write(content))
@@ -165,12 +149,7 @@ def create_file(path: Path, content: bytes) -> bool:
 
 
 def remove_file(path: Path) -> None:
-    """Remove a file for good, if it is there.
-
-    Raises
-    ------
-    PartialError : the folder cannot be written
-    """
+    """Remove a file for good, if it is there; a PartialError where the folder cannot be written."""
     try:
         path.unlink()
         sync_folder(path.parent)
@@ -206,18 +185,8 @@ def write_checksummed(path: Path, data: Mapping[str, Any]) -> None:
 
 
 def parse_checksummed(content: bytes, where: object, hint: str = "") -> dict[str, Any]:
-    """JSON object of a checksummed document, its checksum left out.
-
-    Parameters
-    ----------
-    content : of the document
-    where : its name, for messages
-    hint : what to do about a damaged document
-
-    Raises
-    ------
-    InputError : not a JSON object, or not what was written
-    """
+    """JSON object of a checksummed document, its checksum left out; an InputError, with its name `where` and
+    a hint, unless it is a JSON object exactly as it was written."""
     data = parse_json(content, where, hint)
     try:
         unchanged = checksummed(data) == content
@@ -230,7 +199,7 @@ def parse_checksummed(content: bytes, where: object, hint: str = "") -> dict[str
 
 
 def parse_json(content: bytes, where: object, hint: str = "") -> dict[str, Any]:
-    """A JSON object; parameters and errors as :func:`parse_checksummed`."""
+    """A JSON object; an InputError, with its name `where` and a hint, where it is none."""
     try:
         data = json.loads(content.decode(), parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
@@ -241,17 +210,8 @@ def parse_json(content: bytes, where: object, hint: str = "") -> dict[str, Any]:
 
 
 def read_json(path: Path, hint: str = "") -> dict[str, Any]:
-    """JSON object stored in a file.
-
-    Parameters
-    ----------
-    path : Path
-    hint : what to do about a damaged document
-
-    Raises
-    ------
-    InputError : missing, unreadable, or not a JSON object
-    """
+    """JSON object stored in a file; an InputError where it is missing, unreadable or, with the hint,
+    damaged."""
     refuse_special(path)
     try:
         content = path.read_bytes()

@@ -18,15 +18,8 @@ def write_document(path: Path, text: str, *, overwrite: bool = False) -> None:
     """Write a text that users may edit, atomically. The last line of YAML and HTML is a comment with a digest
     of the others; of other formats the digest is in a hidden file.
 
-    Parameters
-    ----------
-    path : Path
-    overwrite : replace it also if it has been edited
-
-    Raises
-    ------
-    InputError : there is a file that has been edited, or that is not of this program
-    PartialError : it cannot be written
+    An InputError where there is a file that has been edited, unless it is to be overwritten, or that is not
+    of this program; a PartialError where it cannot be written.
     """
     body = text if text.endswith("\n") else f"{text}\n"
     content = body.encode()

@@ -52,12 +52,8 @@ def cache_folder() -> Path:
 def owned(folder: Path) -> Iterator[None]:
     """Own a folder in a block that writes to it, so that no other command does.
 
-    The folder is made if it is missing, and removed again if nothing was written.
-
-    Raises
-    ------
-    PartialError : another process owns it, or it cannot be written
-    InputError : it cannot be made
+    The folder is made if it is missing, and removed again if nothing was written. A PartialError where
+    another process owns it, or it cannot be written; an InputError where it cannot be made.
     """
     if folder.exists() and not folder.is_dir():
         raise InputError("is a file, not a folder", where=folder)
@@ -95,17 +91,8 @@ def is_empty(folder: Path) -> bool:
 
 
 def check_folder(folder: Path, is_ours: Callable[[Path], bool], what: str) -> bool:
-    """Whether an output folder contains a run to resume; False where it is missing or empty.
-
-    Parameters
-    ----------
-    is_ours : whether the folder contains a record of this kind
-    what : name of the output, for the message
-
-    Raises
-    ------
-    InputError : it is a file, or contains something else
-    """
+    """Whether an output folder contains a run to resume, by `is_ours`; False where it is missing or empty. An
+    InputError where it is a file, or contains something else; `what` names the output."""
     if folder.exists() and not folder.is_dir():
         raise InputError("is a file, not a folder", where=folder)
     empty = is_empty(folder)
@@ -124,24 +111,15 @@ def free_space(folder: Path) -> int:
 
 
 def check_space(folder: Path, size: float, hint: str) -> None:
-    """Refuse output of this size, in bytes, that does not fit on the disk of its folder.
-
-    Raises
-    ------
-    InputError : less is free; `hint` names the option to change
-    """
+    """Refuse output of this size, in bytes, that does not fit on the disk of its folder; `hint` names the
+    option to change."""
     free = free_space(folder)
     if size > free:
         raise InputError(f"needs {size_text(size)}; {size_text(free)} are free", where=folder, hint=hint)
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder and those above it, where they are missing.
-
-    Raises
-    ------
-    InputError : it cannot be made
-    """
+    """Make a folder and those above it, where they are missing; an InputError where it cannot be made."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -151,14 +129,8 @@ def make_folder(folder: Path) -> None:
 def other_configuration(
     folder: object, what: str, old: Mapping[str, Any], new: Mapping[str, Any]
 ) -> InputError:
-    """Error for a folder that was written with another configuration.
-
-    Parameters
-    ----------
-    folder : path or URL, for the message
-    what : content of the folder, for the message
-    old, new : plain data that determine the content: those of the folder, and the requested ones
-    """
+    """Error for a folder, path or URL, that holds `what` of another configuration; `old` and `new` are plain
+    data that determine the content: those of the folder, and the requested ones."""
     changes = in_short(differences(old, new)) or "inputs differ"
     return InputError(
         f"holds {what} of another configuration: {changes}",
@@ -168,12 +140,8 @@ def other_configuration(
 
 
 def remove_unfinished(folder: Path, names: Container[str]) -> None:
-    """Remove the temporary files that killed processes left of the files `names`.
-
-    Raises
-    ------
-    PartialError : the folder cannot be written
-    """
+    """Remove the temporary files that killed processes left of the files `names`; a PartialError where the
+    folder cannot be written."""
     for path in list(folder.iterdir()):
         match = re.fullmatch(rf"\.(.+?){TEMPORARY}", path.name)
         if match is not None and match[1] in names:
@@ -220,12 +188,8 @@ class OutputKind:
     what: str
 
     def read(self, folder: Path) -> dict[str, Any] | None:
-        """The record of a folder; None where it has none of this kind.
-
-        Raises
-        ------
-        InputError : it has another schema version
-        """
+        """The record of a folder; None where it has none of this kind, an InputError where it has another
+        schema version."""
         try:
             found = read_json(folder / self.record)
         except InputError:
@@ -328,13 +292,9 @@ class OutputFolder:
         self._kind.write(self.path, self._record.model_copy(update={"items": items}).model_dump())
 
     def finished(self, name: str, **wanted: Any) -> dict[str, Any] | None:
-        """Facts stored by :meth:`keep`, if all files of the item are there as they were written. An item that
-        lacks a file, or has other facts than `wanted`, is to be made again.
-
-        Raises
-        ------
-        InputError : a file has changed
-        """
+        """Facts stored by :meth:`keep`, if all files of the item are there as they were written; an
+        InputError where one has changed. An item that lacks a file, or has other facts than `wanted`, is to
+        be made again."""
         item = self._record.items.get(name)
         if item is None:
             return None
@@ -368,13 +328,8 @@ class OutputFolder:
             self._save()
 
     def add(self, name: str, write: Callable[[Path], Stored]) -> Stored:
-        """Write a file with ``write(path)``, atomically, unless it is finished; its size and digest.
-
-        Raises
-        ------
-        InputError : it has changed since it was written
-        PartialError : it cannot be written
-        """
+        """Write a file with ``write(path)``, atomically, unless it is finished; its size and digest. An
+        InputError where it has changed since it was written, a PartialError where it cannot be written."""
         if self.finished(name) is None:
             path = self.path / name
             if not self.path.is_dir():

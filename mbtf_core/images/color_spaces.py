@@ -98,16 +98,8 @@ def rec709(x: F64) -> F64:
 
 
 def rgb_to_xyz(chromaticities: Sequence[float]) -> F64:
-    """The matrix (3, 3) from linear RGB to XYZ whose white has Y = 1.
-
-    Parameters
-    ----------
-    chromaticities : x, y of red, green, blue and white
-
-    Raises
-    ------
-    ValueError : they span no color space
-    """
+    """The matrix (3, 3) from linear RGB to XYZ whose white has Y = 1, by x, y of red, green, blue and white;
+    a ValueError where they span no color space."""
     x, y = np.reshape(np.asarray(chromaticities, np.float64), (4, 2)).T
     xyz = np.stack([x, y, 1.0 - x - y])
     if not np.isfinite(xyz).all() or y[3] <= 0 or abs(np.linalg.det(xyz[:, :3])) < 1e-6:
@@ -131,12 +123,7 @@ def _to_rec709(to_xyz: F64, white: F64) -> F64 | None:
 
 
 def from_chromaticities(chromaticities: Sequence[float], *curves: Curve) -> DeclaredSpace:
-    """The space of given primaries and curves.
-
-    Raises
-    ------
-    ValueError : the chromaticities span no color space
-    """
+    """The space of given primaries and curves; a ValueError where the chromaticities span none."""
     to_xyz = rgb_to_xyz(chromaticities)
     named = (n for n, p in _PRIMARIES.items() if np.abs(np.subtract(p, chromaticities)).max() < _SAME)
     name = next(named, "own primaries")
@@ -144,12 +131,8 @@ def from_chromaticities(chromaticities: Sequence[float], *curves: Curve) -> Decl
 
 
 def from_cicp(content: bytes) -> DeclaredSpace:
-    """The space of a ``cICP`` chunk of PNG (ITU-T H.273).
-
-    Raises
-    ------
-    ValueError : it is not supported, such as HDR video
-    """
+    """The space of a ``cICP`` chunk of PNG (ITU-T H.273); a ValueError where it is not supported, such as HDR
+    video."""
     primaries, transfer, matrix, full = struct.unpack(">4B", content)
     curves: dict[int, tuple[Curve, ...]] = {
         **dict.fromkeys((1, 6, 14, 15), (rec709,) * 3),
@@ -164,17 +147,8 @@ def from_cicp(content: bytes) -> DeclaredSpace:
 
 
 def from_icc(profile: bytes, name: str) -> DeclaredSpace:
-    """The space of an ICC profile of a matrix and curves, or of a curve for gray (ICC.1:2022, 8.3, 8.4).
-
-    Parameters
-    ----------
-    profile : content of the profile
-    name : its description
-
-    Raises
-    ------
-    ValueError : it is of another kind, or damaged
-    """
+    """The space of an ICC profile of a matrix and curves, or of a curve for gray (ICC.1:2022, 8.3, 8.4); a
+    ValueError for another kind, or a damaged one. `name` is its description."""
     try:
         space, connection = profile[16:20], profile[20:24]
         (count,) = struct.unpack_from(">I", profile, 128)

@@ -61,11 +61,7 @@ def read_environment(path: Path, most_rows: int) -> NDArray[np.float32]:
 
 def read_linear(path: Path) -> NDArray[np.float32]:
     """Linear RGB (H, W, 3) of an EXR, HDR, PNG, JPG, TIFF or npy file; integers are sRGB, gray becomes RGB.
-
-    Raises
-    ------
-    InputError : the file cannot be read, or a pixel is NaN or infinite
-    """
+    An InputError where the file cannot be read, or a pixel is NaN or infinite."""
     suffix = path.suffix.lower()
     if path.is_file() and suffix not in (_RADIANCE, *SUFFIXES):
         raise InputError(
@@ -80,12 +76,8 @@ def read_linear(path: Path) -> NDArray[np.float32]:
 
 
 def read_radiance(path: Path) -> Image:
-    """Linear RGB of the primaries that the header states, divided by its exposure.
-
-    Raises
-    ------
-    InputError : the file is missing, damaged, too large, or stores XYZ
-    """
+    """Linear RGB of the primaries that the header states, divided by its exposure; an InputError where the
+    file is missing, damaged, too large, or stores XYZ."""
     import imagecodecs
 
     with opened(path) as stream:

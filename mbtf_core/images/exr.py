@@ -63,12 +63,9 @@ def check_floats(channels: dict[str, NDArray[Any]], path: Path) -> None:
 def read_layers(path: Path, max_pixels: int) -> tuple[dict[str, NDArray[Any]], dict[str, dict[str, Any]]]:
     """Channels (H, W) by name of all parts, float16, float32 or uint32, and the header of each one's part.
 
-    With several parts, the channels of a part carry its name in front, as layers do.
-
-    Raises
-    ------
-    InputError : the file is damaged, larger than `max_pixels`, deep, subsampled or cropped (data window
-        unlike the display window), or two channels have one name
+    With several parts, the channels of a part carry its name in front, as layers do. An InputError where the
+    file is damaged, larger than `max_pixels`, deep, subsampled or cropped (data window unlike the display
+    window), or two channels have one name.
     """
     parts = _read(path, max_pixels)
     out: dict[str, NDArray[Any]] = {}
@@ -94,11 +91,7 @@ def lossy_excess(header: Mapping[str, Any]) -> tuple[float, str]:
 
 def read_parts(path: Path, max_pixels: int) -> dict[str, tuple[dict[str, Any], dict[str, NDArray[Any]]]]:
     """Header and channels (H, W) of every part by its name, float16 or float32; their sizes may differ.
-
-    Raises
-    ------
-    InputError : as :func:`read_layers`, two parts have one name, or a channel stores integers
-    """
+    Errors are those of :func:`read_layers`; parts of one name and channels of integers are refused."""
     out: dict[str, tuple[dict[str, Any], dict[str, NDArray[Any]]]] = {}
     for head, channels in _read(path, max_pixels, cropped=True):
         name = str(head.get("name", ""))
@@ -168,16 +161,8 @@ def _checked_size(head: dict[str, Any], path: Path, max_pixels: int, cropped: bo
 def write_channels(
     path: Path, channels: Mapping[str, NDArray[np.float32]], header: Mapping[str, Any] | None = None
 ) -> Stored:
-    """Write an uncompressed EXR file of named channels (H, W), atomically.
-
-    Parameters
-    ----------
-    header : attributes of the file
-
-    Raises
-    ------
-    PartialError : the disk is full or the folder cannot be written
-    """
+    """Write an uncompressed EXR file of named channels (H, W), atomically, with these attributes; a
+    PartialError where the disk is full or the folder cannot be written."""
     import OpenEXR
 
     head = {"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage, **(header or {})}
@@ -189,17 +174,10 @@ def write_channels(
 def encode_parts(
     parts: Mapping[str, Mapping[str, NDArray[np.float32]]], header: Mapping[str, Any] | None = None
 ) -> bytes:
-    """The bytes of an uncompressed EXR file of several named parts with channels (H, W) by name.
+    """The bytes of an uncompressed EXR file of several named parts with channels (H, W) by name, each with
+    these attributes; a PartialError where the folder for temporary files cannot be written.
 
     All parts begin in the upper left corner of one display window, which is as large as the largest of them.
-
-    Parameters
-    ----------
-    header : attributes of every part
-
-    Raises
-    ------
-    PartialError : the folder for temporary files cannot be written
     """
     import OpenEXR
 
@@ -244,17 +222,9 @@ def layers(names: list[str]) -> dict[str, list[str]]:
 def choose_channels(
     names: list[str], path: Path, channel: str | None, prefer: Callable[[str], bool] | None = None
 ) -> list[str]:
-    """Channels to read, in order.
-
-    Parameters
-    ----------
-    channel : the name of a channel or of a layer; None to choose: the only image, else the only one whose
-        label `prefer` accepts, else the one without a prefix, else the only one of several channels
-
-    Raises
-    ------
-    InputError : no such channel, or the choice is unclear
-    """
+    """Channels to read, in order: the channel or layer of that name; else the only image, else the only one
+    whose label `prefer` accepts, else the one without a prefix, else the only one of several channels. An
+    InputError where there is no such channel, or the choice is unclear."""
     found = layers(names)
     listed = ", ".join(sorted(names))
     if channel is not None:

@@ -16,20 +16,9 @@ _ANY_RATIO, _MAX_RATIO = 1 << 29, 1 << 10
 
 
 def check_size(path: Path, rows: int, columns: int, max_pixels: int, pixel_bytes: int = 1) -> None:
-    """Refuse an image by the size that its header claims.
-
-    Parameters
-    ----------
-    path : the file
-    rows, columns : claimed size
-    max_pixels : largest accepted number of pixels
-    pixel_bytes : bytes of a decoded pixel
-
-    Raises
-    ------
-    InputError : the image has no pixels, more than `max_pixels`, or more than the file can hold; or over
-        512 MiB of pixels come from a file of less than 1/1024 of that
-    """
+    """Refuse an image by the size that its header claims: no pixels, more than `max_pixels`, or more than the
+    file can hold; or over 512 MiB of pixels, of `pixel_bytes` each, from a file of less than 1/1024 of
+    that."""
     pixels = rows * columns
     if rows <= 0 or columns <= 0:
         raise InputError("contains no pixels", where=path)

@@ -167,18 +167,8 @@ def read_image(
 
 
 def decode_image(content: bytes, kinds: Container[str], where: Path) -> Image:
-    """Decode an image that is not in a file of its own.
-
-    Parameters
-    ----------
-    content : the bytes of an image file
-    kinds : accepted formats, such as ``PNG`` and ``JPEG``
-    where : where it comes from, for messages
-
-    Raises
-    ------
-    InputError : it has another format, or as :func:`read_image`
-    """
+    """Decode the bytes of an image file that is not in a file of its own, of accepted formats such as ``PNG``
+    and ``JPEG``; `where` it comes from is for messages. Errors are those of :func:`read_image`."""
     kind = next((kind for magic, kind in _MAGIC.items() if content.startswith(magic)), None)
     if kind is None or kind not in kinds:
         raise InputError(f"is no image that is read ({kind or 'unknown data'})", where=where)

@@ -66,14 +66,10 @@ _Color = tuple[ColorSpace | None, DeclaredSpace | None, str | None]
 
 
 def pillow_tags(info: Mapping[Any, Any], exif: Any, path: Path | None = None) -> Tags:
-    """Tags from the metadata that Pillow read.
+    """Tags from the metadata that Pillow read, and from a PNG file, whose ``cICP`` it does not read.
 
     ``cICP`` takes precedence over the profile, that over the ``sRGB`` chunk, and that over ``gAMA`` and
     ``cHRM`` (PNG specification, third edition, 4.3). Cameras declare Adobe RGB in EXIF (DCF 2.0).
-
-    Parameters
-    ----------
-    path : a PNG file, whose ``cICP`` Pillow does not read
     """
     coded = None if path is None else _cicp_chunk(path)
     gamma, primaries = info.get("gamma"), info.get("chromaticity")

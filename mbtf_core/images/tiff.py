@@ -22,23 +22,11 @@ _SHORT = "cannot be read as a TIFF image (file ends early)"
 
 
 def read_tiff(path: Path, max_pixels: int) -> tuple[NDArray[Any] | None, Tags]:
-    """The first image of a TIFF file, however compressed, and its tags.
+    """The first image (H, W, C) of a TIFF file, however compressed, and its tags.
 
-    Parameters
-    ----------
-    path : Path
-    max_pixels : larger images are refused
-
-    Returns
-    -------
-    numbers : (H, W, C) array or None
-        C = 1..4: uint8, uint16 or floats as stored; float64 of other integers. None for kinds that Pillow
-        reads: palettes, single bits, YCbCr.
-    tags : Tags
-
-    Raises
-    ------
-    InputError : the file is damaged, cut short, too large, or of an unsupported kind
+    Its 1 to 4 channels are uint8, uint16 or floats as stored, float64 of other integers; None for kinds that
+    Pillow reads: palettes, single bits, YCbCr. An InputError where the file is damaged, cut short, larger
+    than `max_pixels`, or of an unsupported kind.
     """
     import tifffile
 

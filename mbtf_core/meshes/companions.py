@@ -36,18 +36,11 @@ class Companions:
         self.warnings: list[str] = []
 
     def find(self, name: str) -> Path:
-        """A file by its name.
+        """A file by the name that the mesh or its materials give it; an InputError where there is none, or
+        several whose names differ in case alone.
 
         Names may have another case than the file and the separators of Windows. Where no file is at the whole
         path, one at its end counts, with a warning: paths often come from another machine.
-
-        Parameters
-        ----------
-        name : as the mesh or its materials give it
-
-        Raises
-        ------
-        InputError : there is none, or several whose names differ in case alone
         """
         if name in self.files:
             return self.files[name]
@@ -70,12 +63,8 @@ class Companions:
 
     def color(self, name: str) -> NDArray[np.float32]:
         """Linear Rec.709 colors (h, w, 3) of an image, from the color space that it declares; without one,
-        integers are sRGB. Colors beyond Rec.709 are clamped, with a warning.
-
-        Raises
-        ------
-        InputError : the image is missing, unreadable, or not within [0, 1]
-        """
+        integers are sRGB. Colors beyond Rec.709 are clamped, with a warning. An InputError where the image is
+        missing, unreadable, or not within [0, 1]."""
         image = self._image(name)
         stored = image.stored
         if stored.shape[2] in (2, 4) and np.any(stored[..., -1] != image.white):

@@ -120,15 +120,9 @@ def groups_of(key: I64) -> list[I64]:
 
 
 def with_colors(shape: MeshShape, path: Path, warnings: list[str]) -> MeshShape:
-    """A shape whose colors of vertices go with its base color.
+    """A shape of a file whose colors of vertices go with its base color; warnings are added.
 
     Images take precedence over colors of vertices; colors that are all white are none.
-
-    Parameters
-    ----------
-    shape : as it was read
-    path : its file
-    warnings : warnings are added
     """
     colors, base = shape.colors, shape.values.get("base_color")
     if colors is None or np.all(colors == 1.0):

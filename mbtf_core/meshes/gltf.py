@@ -58,16 +58,8 @@ class _Group:
 
 
 def read_gltf(path: Path) -> MeshContent:
-    """Read a glTF file.
-
-    Parameters
-    ----------
-    path : a ``.gltf`` or ``.glb`` file
-
-    Raises
-    ------
-    InputError : it is damaged, or has what is not read and cannot be left out
-    """
+    """Read a ``.gltf`` or ``.glb`` file; an InputError where it is damaged, or has what is not read and
+    cannot be left out."""
     file = GltfFile(path)
     materials = Materials(file)
     placed = _placements(file)

@@ -126,12 +126,8 @@ class GltfFile(Companions):
         return values[:, 0].astype(np.int64)
 
     def of_uri(self, uri: str) -> tuple[bytes, Path | None]:
-        """(content, file) of a URI; None for data within it.
-
-        Raises
-        ------
-        InputError : the file is missing or cannot be read, or the URI is none of a file
-        """
+        """(content, file) of a URI, None for data within it; an InputError where the file is missing or
+        cannot be read, or the URI is none of a file."""
         if match := _DATA_URI.match(uri):
             try:
                 if match[1] is None:

@@ -50,12 +50,7 @@ class _Source:
 
 
 class Materials:
-    """The materials of a file.
-
-    Parameters
-    ----------
-    file : takes up warnings, and the files of images that are read
-    """
+    """The materials of a file, which takes up warnings, and the files of images that are read."""
 
     def __init__(self, file: GltfFile) -> None:
         self.file = file
@@ -82,20 +77,10 @@ class Materials:
     def read(
         self, material: GltfMaterial, places: Mapping[int, F64]
     ) -> tuple[dict[str, Value], dict[str, InputError]]:
-        """What a material reflects.
+        """What a material reflects: values by role, and faults by role that cannot be read.
 
-        Parameters
-        ----------
-        material : GltfMaterial
-        places : dict of int to (3, 3) array; texture coordinates (u, v, 1) of each set from those of the
-            shape, v up. Others are lacking.
-
-        Returns
-        -------
-        values : dict of str to Value
-            By role.
-        faults : dict of str to InputError
-            Roles that cannot be read.
+        `places` has matrices (3, 3) that turn texture coordinates (u, v, 1) of the shape, v up, into those of
+        each set; other sets are lacking.
         """
         values: dict[str, Value] = {}
         faults: dict[str, InputError] = {}

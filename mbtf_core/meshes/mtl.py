@@ -51,12 +51,8 @@ class MtlMaterial:
     statements: dict[str, tuple[str, str, int]] = field(default_factory=dict)
 
     def number(self, key: str, count: int = 1) -> Any:
-        """Number or color (3,) in [0, 1] of a statement; None where it is missing.
-
-        Raises
-        ------
-        InputError : it is something else
-        """
+        """Number or color (3,) in [0, 1] of a statement; None where it is missing, an InputError where it is
+        something else."""
         if key not in self.statements:
             return None
         _, text, line = self.statements[key]
@@ -78,18 +74,8 @@ def _wanted(count: int) -> str:
 
 
 def read_mtl(path: Path, found: dict[str, MtlMaterial], warnings: list[str]) -> None:
-    """Read a file of materials.
-
-    Parameters
-    ----------
-    path : the file
-    found : materials by name; those of the file are added. Of several of one name the first counts.
-    warnings : warnings are added
-
-    Raises
-    ------
-    InputError : it cannot be read, or is no text
-    """
+    """Read a file of materials and add them, and warnings; of several of one name the first counts. An
+    InputError where it cannot be read, or is no text."""
     data = read_bytes(path)
     if b"\0" in data:
         raise InputError("is not a text of materials", where=path)
@@ -120,21 +106,11 @@ def as_text(data: bytes) -> str:
 def material_values(
     material: MtlMaterial, companions: Companions
 ) -> tuple[dict[str, Any], dict[str, InputError], list[str]]:
-    """What a material says, by role.
+    """What a material says, by role: values and faults as of :class:`~mbtf_core.meshes.content.MeshShape`,
+    and warnings without the name of the material.
 
-    ``Kd`` is linear and multiplies ``map_Kd``, as other numbers multiply their images.
-
-    Parameters
-    ----------
-    material : the material
-    companions : finds its images, collects them and warnings of them
-
-    Returns
-    -------
-    values, faults : dict
-        As of :class:`~mbtf_core.meshes.content.MeshShape`.
-    remarks : list of str
-        Warnings without the name of the material.
+    ``Kd`` is linear and multiplies ``map_Kd``, as other numbers multiply their images. `companions` finds the
+    images, and collects them and warnings of them.
     """
     values: dict[str, Any] = {}
     faults: dict[str, InputError] = {}

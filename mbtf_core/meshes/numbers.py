@@ -14,13 +14,7 @@ from mbtf_core.paths import opened
 
 
 def parse(text: bytes, kind: type) -> NDArray[Any] | None:
-    """Numbers between blanks and line breaks; None where one word is none.
-
-    Parameters
-    ----------
-    text : the words
-    kind : of the numbers, ``np.float64`` or ``np.int64``
-    """
+    """Numbers, np.float64 or np.int64, between blanks and line breaks; None where one word is none."""
     if not text.strip():
         return np.zeros(0, kind)
     with warnings.catch_warnings():
@@ -38,12 +32,7 @@ def words_per_line(text: bytes) -> NDArray[np.int64]:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Content of a file.
-
-    Raises
-    ------
-    InputError : it cannot be read, or is empty
-    """
+    """Content of a file; an InputError where it cannot be read, or is empty."""
     with opened(path) as stream:
         data = stream.read()
     if not data:

@@ -27,18 +27,11 @@ _OTHERS = {b"l": "lines", b"p": "points", b"curv": "curves", b"curv2": "curves",
 
 
 def read_obj(path: Path) -> MeshContent:
-    """Read an OBJ file.
+    """Read an OBJ file; an InputError where it is none, has no triangles, or a polygon has corners that it
+    lacks.
 
     There is a shape for the triangles of each material, and another one for those of them that lack texture
     coordinates. Colors of vertices are sRGB, as programs write them, and multiply those of the material.
-
-    Parameters
-    ----------
-    path : the file
-
-    Raises
-    ------
-    InputError : the file is no OBJ file, has no triangles, or a polygon has corners that the file lacks
     """
     lines = _Lines(path)
     positions, colors = lines.positions()

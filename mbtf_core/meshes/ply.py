@@ -233,18 +233,10 @@ _TEXTURE = "TextureFile"
 
 
 def read_ply(path: Path) -> MeshContent:
-    """Read a PLY file.
+    """Read a PLY file; an InputError where it is none, is damaged or cut, or has no triangles.
 
     There is a shape for each image, or a single one, and another one for triangles that lack texture
     coordinates. Integer colors are sRGB, floats are linear.
-
-    Parameters
-    ----------
-    path : the file
-
-    Raises
-    ------
-    InputError : the file is no PLY file, is damaged or cut, or has no triangles
     """
     content = _read_elements(path)
     vertex, face = _element(content, "vertex", path), content.elements.get("face")

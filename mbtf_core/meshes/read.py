@@ -27,21 +27,9 @@ _THIN = 0.5
 
 
 def read_mesh_content(path: Path) -> MeshContent:
-    """Read a file of triangles.
-
-    Parameters
-    ----------
-    path : a file whose suffix is among ``MESH_FILES``
-
-    Returns
-    -------
-    MeshContent
-        At least one shape; vertices may not be finite.
-
-    Raises
-    ------
-    InputError : the format is not read, the file is missing or damaged, or it has no triangles
-    """
+    """Read a file of triangles whose suffix is among ``MESH_FILES``: at least one shape, whose vertices may
+    not be finite. An InputError where the format is not read, the file is missing or damaged, or it has no
+    triangles."""
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise InputError(f"'{path.suffix}' is not a mesh", where=path, hint=f"give {', '.join(MESH_FILES)}")
@@ -52,15 +40,10 @@ def read_mesh_content(path: Path) -> MeshContent:
 
 
 def seems_up(axis: Literal["y", "z"], vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> bool:
-    """Whether triangles look like a sheet that lies in the plane of x and the other axis.
+    """Whether triangles look like a sheet that lies in the plane of x and the other axis: it is thin along
+    the axis, and most of its area faces along it rather than along the other one.
 
-    It is thin along the axis, and most of its area faces along it rather than along the other one.
-
-    Parameters
-    ----------
-    axis : {"y", "z"}, the axis in question
-    vertices : (n, 3), positions in the axes of the file
-    faces : (m, 3), vertices of each triangle
+    `vertices` (n, 3) are in the axes of the file, `faces` (m, 3) the vertices of each triangle.
     """
     corners = vertices[faces]
     up, other = (1, 2) if axis == "y" else (2, 1)

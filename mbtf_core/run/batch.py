@@ -42,12 +42,7 @@ def site_preload() -> list[str]:
 
 def _site_options(engine: str, options: Mapping[str, Any]) -> dict[str, Any]:
     """Options of a file, with the lists of Dask's configuration where it gives none; dask-jobqueue reads the
-    rest of that itself.
-
-    Raises
-    ------
-    ValueError : an option is a key of the file
-    """
+    rest of that itself. A ValueError where an option is a key of the file."""
     dask = import_extra("dask", "--cluster")
     given = {key: value for key, value in options.items() if value is not None}
     for key, ours in _OURS.items():
@@ -64,18 +59,9 @@ def _site_options(engine: str, options: Mapping[str, Any]) -> dict[str, Any]:
 def submitted_jobs(
     config: ClusterConfig, environment: Mapping[str, str], refused: list[str]
 ) -> Iterator[Any]:
-    """A Dask cluster of jobs, which are canceled when the block ends.
-
-    Parameters
-    ----------
-    config : of the jobs
-    environment : variables of the workers
-    refused : gets the reasons why jobs cannot be submitted
-
-    Raises
-    ------
-    OSError, TypeError, ValueError : the batch system or its options cannot be used
-    """
+    """A Dask cluster of jobs with these variables, which are canceled when the block ends. `refused` gets the
+    reasons why jobs cannot be submitted; an OSError, TypeError or ValueError where the batch system or its
+    options cannot be used."""
     handler = signal.getsignal(signal.SIGINT)
     dask_jobqueue = import_extra("dask_jobqueue", "--cluster")
 

@@ -75,13 +75,8 @@ def local_config(workers: int | None = None) -> ClusterConfig:
 
 
 def read_cluster(where: str) -> ClusterConfig:
-    """Meaning of ``--cluster``.
-
-    Raises
-    ------
-    UsageError : it is no cluster
-    InputError : the file is at fault
-    """
+    """Meaning of ``--cluster``; a UsageError where it is no cluster, an InputError where the file is at
+    fault."""
     if match := re.fullmatch(r"local(?::([1-9]\d{0,3}))?", where):
         return local_config(None if match[1] is None else int(match[1]))
     if _ADDRESS.fullmatch(where):

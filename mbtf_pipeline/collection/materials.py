@@ -26,17 +26,11 @@ _LONGEST = 90
 
 
 def find_materials(path: Path) -> list[Path]:
-    """Materials of an entry of ``library``: a material, a folder of them, or a list of paths.
+    """Materials of an entry of ``library``: a material, a folder of them, or a list of paths; an InputError
+    where a list cannot be read.
 
-    Returns
-    -------
-    list of Path
-        Those of a folder and the folders below it, sorted. Files that a YAML file beside them names are parts
-        of its material. Recipes and outputs of the programs are no materials.
-
-    Raises
-    ------
-    InputError : a list cannot be read
+    Those of a folder and the folders below it are sorted. Files that a YAML file beside them names are parts
+    of its material. Recipes and outputs of the programs are no materials.
     """
     path = Path(os.path.normpath(path))
     if path.is_dir():
@@ -90,18 +84,10 @@ def _document(path: Path) -> Mapping[str, Any]:
 
 
 def name_materials(paths: Sequence[Path], taken: Collection[str] = ()) -> list[str]:
-    """Name of each material: that of its file or folder.
+    """Name of each material: that of its file or folder, and none of the names `taken`; a UsageError where a
+    material is listed twice.
 
     Equal ones are prefixed by the parent's name, and numbered if they are still equal.
-
-    Parameters
-    ----------
-    paths : sequence of Path
-    taken : other names, which none of them gets
-
-    Raises
-    ------
-    UsageError : a material is listed twice
     """
     for real, listed in Counter(os.path.realpath(path) for path in paths).items():
         if listed > 1:

@@ -33,18 +33,8 @@ _TABLES = {f.__name__: f for f in (methods, levels, ablations, timing, offsets, 
 
 
 def write_page(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Path]]:
-    """Write the page of a library, or page and tables of a paper.
-
-    Parameters
-    ----------
-    folder : folder of all runs
-    record : content of ``collection.json``
-
-    Returns
-    -------
-    page : HTML file
-    tables : CSV files
-    """
+    """Write the page of a library, or page and tables of a paper, from the content of ``collection.json`` in
+    the folder of all runs; returns the HTML file and the CSV files."""
     if "tables" not in record["recipe"]:
         page = folder / "library.html"
         write_document(page, library_page(record, folder / RUNS))

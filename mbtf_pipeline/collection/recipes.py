@@ -159,21 +159,11 @@ class Collection(Settings):
         return {name: Path(str(layer.generate["material"])) for name, layer in self.materials.items()}
 
     def plan(self, file: Path, quick: bool = False) -> tuple[list[Planned], dict[str, Skipped]]:
-        """The runs in their order, and materials that cannot be run, by name.
+        """The runs in their order, at the full or the quick size, and materials that cannot be run, by name;
+        `file` is the recipe, for messages.
 
-        Parameters
-        ----------
-        file : the recipe, for messages
-        quick : whether to apply the options of the quick size
-
-        Returns
-        -------
-        list of Planned, dict of str to Skipped
-
-        Raises
-        ------
-        InputError : the options of all runs are at fault, or no material can be run
-        UsageError : a material is listed twice
+        An InputError where the options of all runs are at fault, or no material can be run; a UsageError
+        where a material is listed twice.
         """
         paths = self.paths(file)
         if not paths:

@@ -168,25 +168,9 @@ def _learning(one: Planned, planned: Sequence[Planned], recipe: Collection, fold
 def run_one(
     recipe: Recipe, folder: Path, command: str, force: bool, console: Console | None
 ) -> dict[str, Any]:
-    """Run a recipe; a task.
-
-    Parameters
-    ----------
-    recipe : resolved recipe
-    folder : folder of the run
-    command : for the run's record
-    force : run every stage
-    console : receives progress
-
-    Returns
-    -------
-    dict
-        ``seconds`` by stage, ``reference`` and ``fits``: errors, and files of the first picture.
-
-    Raises
-    ------
-    InputError, PartialError : as :func:`~mbtf_pipeline.run.run_recipe`
-    """
+    """Run a resolved recipe in its folder; a task, whose errors are those of
+    :func:`~mbtf_pipeline.run.run_recipe`. Returns ``seconds`` by stage, ``reference`` and ``fits``: errors,
+    and files of the first picture."""
     result = run_recipe(recipe, folder, force=force, command=command, console=console)
     picture = result.comparison["pictures"][0]
     fits = {
@@ -208,12 +192,8 @@ def _write(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Path]]:
 
 
 def write_again(folder: Path) -> Path:
-    """Write the page and tables of finished runs again; returns the page's path.
-
-    Raises
-    ------
-    InputError : the folder contains no runs of several materials, or none that is finished
-    """
+    """Write the page and tables of finished runs again; returns the page's path. An InputError where the
+    folder contains no runs of several materials, or none that is finished."""
     if not is_collection(folder):
         raise InputError("contains no library or paper", where=folder)
     record = read_json(folder / COLLECTION.record)

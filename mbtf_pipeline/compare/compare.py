@@ -55,20 +55,12 @@ def compare(
     progress: Progress,
     runner: Runner,
 ) -> None:
-    """Render references, evaluate all fits at the same pixels, and measure their errors.
+    """Render references with the runner, evaluate all fits (folders by name) at the same pixels, and measure
+    their errors, also on the test split of a data set.
 
-    Parameters
-    ----------
-    shards : data set whose test split the fits are evaluated on
-    fits : folder of the fitted material by name of the fit
-    out : folder for images and records; ``comparison.json`` is written last
-    progress : called with a short note after each image
-    runner : renders the references
-
-    Raises
-    ------
-    InputError : the material, the data set or a fit cannot be read
-    EngineError : ST-LPIPS is requested and its weights are not installed
+    Writes images and records into the folder `out`, ``comparison.json`` last; `progress` is called with a
+    short note after each image. An InputError where the material, the data set or a fit cannot be read, an
+    EngineError where the weights of ST-LPIPS are not installed.
     """
     from mbtf_core.data.dataset import Dataset
     from mbtf_fit import Material

@@ -82,12 +82,8 @@ def write_channels(path: Path, values: NDArray[Any], names: str) -> None:
 
 
 def read_channels(path: Path, *sets: Sequence[str]) -> F32:
-    """Channels (rows, columns, channels) of an EXR image: the first of some sets that it has.
-
-    Raises
-    ------
-    InputError : missing or corrupt
-    """
+    """Channels (rows, columns, channels) of an EXR image: the first of some sets that it has; an InputError
+    where it is missing or corrupt."""
     from mbtf_core.images import exr
 
     found = exr.read_layers(path, 1 << 26)[0]
@@ -102,19 +98,14 @@ _HALVES = [f"value_{half}.{color}" for half in "ab" for color in "RGB"]
 
 
 def read_picture(path: Path) -> F32:
-    """Linear RGB (rows, columns, 3) of ``path`` + ``.exr``; of a reference, the mean of its halves.
-
-    Raises
-    ------
-    InputError : missing or corrupt
-    """
+    """Linear RGB (rows, columns, 3) of ``path`` + ``.exr``, of a reference the mean of its halves; errors are
+    those of :func:`read_channels`."""
     found = read_channels(with_ending(path, ".exr"), "RGB", _HALVES)
     return found if found.shape[-1] == 3 else 0.5 * (found[..., :3] + found[..., 3:])
 
 
 def read_halves(path: Path) -> tuple[F32, F32]:
-    """Both halves of a reference, linear RGB (rows, columns, 3); exceptions are those of
-    :func:`read_picture`."""
+    """Both halves of a reference, linear RGB (rows, columns, 3); errors likewise."""
     both = read_channels(with_ending(path, ".exr"), _HALVES)
     return both[..., :3], both[..., 3:]
 
@@ -127,8 +118,8 @@ def write_map(path: Path, flip: F32) -> None:
 
 
 def read_map(path: Path) -> F32:
-    """Read a map (rows, columns) in [0, 1] written by :func:`write_map`; exceptions are those of
-    :func:`read_picture`."""
+    """Read a map (rows, columns) in [0, 1] that :func:`write_map` wrote; an InputError where it is missing or
+    corrupt."""
     from mbtf_core.images.read import read_image
 
     return read_image(with_ending(path, _FLIP)).pixels[..., 0].astype(np.float32)

@@ -31,12 +31,8 @@ _MAX_RESOLUTION = 256
 
 
 def traced_offset(estimator: Estimator, u: F32, omega_o: NDArray[np.float64]) -> F32:
-    """Lateral displacement (n, 2) in tile widths of the surface seen through points of the reference plane.
-
-    Parameters
-    ----------
-    u : (n, 2) uv; omega_o : (3,) view direction
-    """
+    """Lateral displacement (n, 2) in tile widths of the surface seen through points (n, 2), uv, of the
+    reference plane, in a view direction (3,)."""
     import drjit as dr
     import mitsuba as mi
 
@@ -52,12 +48,7 @@ def traced_offset(estimator: Estimator, u: F32, omega_o: NDArray[np.float64]) ->
 
 
 def read_offset(path: Path) -> F32:
-    """Displacements (rows, columns, 2) in tile widths.
-
-    Raises
-    ------
-    InputError : missing or corrupt
-    """
+    """Displacements (rows, columns, 2) in tile widths; errors are those of :func:`read_channels`."""
     return read_channels(path, "XY")
 
 

@@ -64,17 +64,8 @@ PERCEPTUAL_DEFINITIONS = {
 
 
 def flip(image: ArrayLike, reference: ArrayLike, white: float) -> tuple[float, float, F32]:
-    """LDR-FLIP and HDR-FLIP of linear images (rows, columns, 3) in 1/sr, both from 0 to 1.
-
-    Parameters
-    ----------
-    white : linear value displayed as white, 1/sr
-
-    Returns
-    -------
-    (float, float, (rows, columns) array)
-        Means over pixels, and HDR-FLIP per pixel.
-    """
+    """LDR-FLIP and HDR-FLIP of linear images (rows, columns, 3) in 1/sr, from 0 to 1: means over pixels, and
+    HDR-FLIP per pixel (rows, columns). `white` is the linear value displayed as white, in 1/sr."""
     test, truth = (np.maximum(np.asarray(x, np.float32) / np.float32(white), 0) for x in (image, reference))
     stops = {"startExposure": EXPOSURES[0], "stopExposure": EXPOSURES[-1], "numExposures": len(EXPOSURES)}
     hdr_map, hdr = _evaluate(truth, test, "HDR", **stops, tonemapper=TONE_MAPPER)
@@ -98,12 +89,8 @@ def _evaluate(reference: F32, test: F32, kind: str, **parameters: Any) -> tuple[
 
 
 def ssim(image: ArrayLike, reference: ArrayLike, white: float) -> float | None:
-    """SSIM of linear images (rows, columns, 3) in 1/sr; None if a side is shorter than the window.
-
-    Parameters
-    ----------
-    white : linear value displayed as white, 1/sr
-    """
+    """SSIM of linear images (rows, columns, 3) in 1/sr, of which `white` is displayed as white; None if a
+    side is shorter than the window."""
     from scipy.ndimage import gaussian_filter
 
     test, truth = to_srgb(image, white), to_srgb(reference, white)
@@ -136,12 +123,7 @@ def weights_file() -> Path | None:
 
 
 def require() -> Path:
-    """Path of the weights.
-
-    Raises
-    ------
-    EngineError : the package with its weights is not installed
-    """
+    """Path of the weights; an EngineError where the package with its weights is not installed."""
     file = weights_file()
     if file is None:
         raise extra_error(PACKAGE, "compare.perceptual_metrics")
@@ -182,16 +164,8 @@ def _features(x: Tensor) -> list[Tensor]:
 
 
 def st_lpips(image: ArrayLike, reference: ArrayLike, white: float) -> float | None:
-    """ST-LPIPS of linear images (rows, columns, 3) in 1/sr; None for images too small for the network.
-
-    Parameters
-    ----------
-    white : linear value displayed as white, 1/sr
-
-    Raises
-    ------
-    EngineError : the package with its weights is not installed
-    """
+    """ST-LPIPS of linear images (rows, columns, 3) in 1/sr, of which `white` is displayed as white; None for
+    images too small for the network. Errors are those of :func:`require`."""
     import torch
 
     tensors = _tensors()
@@ -215,18 +189,9 @@ def st_lpips(image: ArrayLike, reference: ArrayLike, white: float) -> float | No
 def perceptual_scores(
     image: ArrayLike, reference: ArrayLike, white: float, with_st_lpips: bool
 ) -> tuple[dict[str, Any], F32]:
-    """Perceptual metrics of linear images (rows, columns, 3) in 1/sr, and the map of HDR-FLIP.
-
-    SSIM and ST-LPIPS are None for images that are too small.
-
-    Parameters
-    ----------
-    white : linear value displayed as white, 1/sr
-
-    Raises
-    ------
-    EngineError : ST-LPIPS was requested and its weights are not installed
-    """
+    """Perceptual metrics of linear images (rows, columns, 3) in 1/sr, of which `white` is displayed as white,
+    and the map of HDR-FLIP. SSIM and ST-LPIPS are None for images that are too small; errors of the latter
+    are those of :func:`require`."""
     ldr, hdr, hdr_map = flip(image, reference, white)
     learned = st_lpips(image, reference, white) if with_st_lpips else None
     return {

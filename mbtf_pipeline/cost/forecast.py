@@ -15,22 +15,9 @@ from mbtf_pipeline.run import DataSet, data_sets, layout_of, survey
 
 
 def forecast_errors(recipe: Recipe, folder: Path, note: Callable[[str], None]) -> dict[str, dict[str, Any]]:
-    """Forecast the error of each fit of a run.
-
-    Parameters
-    ----------
-    recipe : Recipe
-        Its fits may have an error to stop at.
-    folder : Path
-        Of the run, whose data are used where they are complete.
-    note : callable
-        Called before pilots, which take a part of the training time.
-
-    Returns
-    -------
-    dict of str to dict
-        Name of the fit → ``source``, ``text`` and, from pilots, the forecast.
-    """
+    """Forecast the error of each fit of a run, by pilots where its data in the folder are complete; `note` is
+    called before pilots, which take a part of the training time. Returns ``source``, ``text`` and, from
+    pilots, the forecast by name of the fit."""
     from mbtf_fit.training.forecast import forecast_fit
 
     stale = survey(recipe, folder)

@@ -146,12 +146,8 @@ class GeneratorBenchmark:
         return self._references[key]
 
     def check_variation(self) -> None:
-        """Refuse a material that gives a fit nothing to learn.
-
-        Raises
-        ------
-        InputError : it reflects nothing, or the same everywhere
-        """
+        """Refuse a material that gives a fit nothing to learn: it reflects nothing, or the same
+        everywhere."""
         reference, where = self.reference({}), self.config.material
         if not reference.mean > 0:
             hint = "study a material with a base color or gloss"

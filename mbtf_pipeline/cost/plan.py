@@ -86,14 +86,9 @@ class StudyPlan:
 
 
 def plan_study(recipe: Recipe, folder: Path, *, seconds: float, seed: int | None = None) -> StudyPlan:
-    """What :func:`~mbtf_pipeline.cost.study.run_study` would measure, by the rate of the generator that
-    the folder has, or that of a pilot on this machine; nothing is written.
-
-    Raises
-    ------
-    InputError
-        The folder holds something else.
-    """
+    """What :func:`~mbtf_pipeline.cost.study.run_study` would measure, by the rate of the generator that the
+    folder has, or that of a pilot on this machine; nothing is written. An InputError where the folder holds
+    something else."""
     record = STUDY.read(folder) if STUDY.check(folder) else None
     job = Job.load(study_config(recipe.generate, seed))
     # Alone, as each pilot takes all processors.

@@ -112,13 +112,8 @@ class Run(Configuration):
         )
 
     def measure(self, conditions: Conditions) -> Measurement:
-        """Generate the data, fit, and evaluate.
-
-        Raises
-        ------
-        InputError : the fit diverged
-        PartialError : the disk is full
-        """
+        """Generate the data, fit, and evaluate; an InputError where the fit diverged, a PartialError where
+        the disk is full."""
         from mbtf_fit import FitConfig, fit
 
         test = test_set(conditions)

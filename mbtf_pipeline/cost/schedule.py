@@ -122,15 +122,8 @@ class Measurements:
     def measure(self, wanted: Iterable[Configuration], *, independent: bool) -> None:
         """Measure configurations; each is taken once a worker is nearly free.
 
-        Parameters
-        ----------
-        wanted : iterable of Configuration
-        independent : whether one that fails says nothing about the others
-
-        Raises
-        ------
-        InputError : a configuration failed, which is not independent
-        PartialError : a worker died, or the disk is full
+        One that fails says nothing about others that are `independent`; it is an InputError for those that
+        are not. A PartialError where a worker died, or the disk is full.
         """
 
         def items() -> Iterator[Item]:

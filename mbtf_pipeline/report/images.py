@@ -110,12 +110,8 @@ def map_uri(values: Pixels, name: Palette, reduction: int = 1) -> str:
 
 
 def file_uri(path: Path, most: int | None = None) -> str:
-    """``data:`` URI of an image file as JPEG, shrunk to so many pixels along a side at most.
-
-    Raises
-    ------
-    OSError : missing or corrupt
-    """
+    """``data:`` URI of an image file as JPEG, shrunk to so many pixels along a side at most; an OSError where
+    it is missing or corrupt."""
     from PIL import Image
 
     with Image.open(path) as image:
@@ -193,16 +189,8 @@ def picture_section(
 def scaled_maps(
     maps: Mapping[Palette, Mapping[str, Mapping[str, Pixels]]],
 ) -> tuple[dict[str, Any], Gallery, dict[str, float]]:
-    """Error maps on common scales, which a diverged fit does not widen.
-
-    Parameters
-    ----------
-    maps : by kind, fit and file
-
-    Returns
-    -------
-    (color bar of each kind; images by name; share of pixels beyond the scale of those with more than a few)
-    """
+    """Error maps by kind, fit and file on common scales, which a diverged fit does not widen: the color bar
+    of each kind, images by name, and the share of pixels beyond the scale of those with more than a few."""
     bars: dict[str, Any] = {}
     images: Gallery = {}
     beyond: dict[str, float] = {}
@@ -297,12 +285,8 @@ def _numbers(comparison: Mapping[str, Any], picture: Mapping[str, Any], kind: st
 def displacements(
     folder: Path, records: list[dict[str, Any]], fit: str | None
 ) -> tuple[list[Pixels], list[float], float]:
-    """Displacements towards the viewer, traced (`fit` is None) or learned, minus their median.
-
-    Returns
-    -------
-    (one map per record, their medians in tile widths, end of their common scale)
-    """
+    """Displacements towards the viewer, traced (`fit` is None) or learned, minus their median: one map per
+    record, their medians in tile widths, and the end of their common scale."""
     maps: list[Pixels] = [
         towards_view(read_offset(folder / _offset_file(r, fit)), SceneView(**r["view"])) for r in records
     ]

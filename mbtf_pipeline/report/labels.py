@@ -21,15 +21,9 @@ _PLACES = tuple(
 
 
 def place_labels(axes: Any, labels: Sequence[Any]) -> None:
-    """Move annotations to the first places about their points that cover least of lines, bars and labels.
-
-    Parameters
-    ----------
-    axes : matplotlib.axes.Axes
-        With all marks drawn and its final limits.
-    labels : sequence of matplotlib.text.Annotation
-        Their positions are offsets in typographic points.
-    """
+    """Move annotations, whose positions are offsets in typographic points, to the first places about their
+    points that cover least of lines, bars and labels. The matplotlib axes have all marks drawn, and their
+    final limits."""
     if not labels:
         return
     axes.figure.draw_without_rendering()  # Lays the axes out.

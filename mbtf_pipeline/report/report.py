@@ -112,15 +112,8 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
 
 
 def write_viewer(folder: Path, title: str, comparison: Mapping[str, Any]) -> None:
-    """Write ``viewer.html`` of a finished run: its fits, and path-traced pictures beside them; none where no
-    fit can be shown in a browser.
-
-    Parameters
-    ----------
-    folder : folder of the run
-    title : of the page
-    comparison : content of ``comparison.json``
-    """
+    """Write ``viewer.html`` of a finished run with the content of its ``comparison.json``: its fits, and
+    path-traced pictures beside them; none where no fit can be shown in a browser."""
     from mbtf_fit import Material
     from mbtf_fit.viewer.extras import poster
     from mbtf_fit.viewer.page import material_content, write_page

@@ -163,12 +163,7 @@ def _unexplained(group: Mapping[str, Any] | None) -> Estimate:
 
 
 def training_context(fits: Mapping[str, Path]) -> dict[str, Any]:
-    """Data about training, from the folders of the fits.
-
-    Raises
-    ------
-    InputError : a folder contains no material
-    """
+    """Data about training, from the folders of the fits; an InputError where one contains no material."""
     from mbtf_fit import Material, read_history
 
     histories = {name: read_history(folder) for name, folder in fits.items()}
@@ -190,13 +185,7 @@ def training_context(fits: Mapping[str, Path]) -> dict[str, Any]:
 
 
 def time_tables(folder: Path, stages: Sequence[str], comparison: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Tables of the time that each part of a run took.
-
-    Parameters
-    ----------
-    folder : of the run
-    stages : names of finished stages
-    """
+    """Tables of the time that each part of a run took, by the names of its finished stages."""
     stamps = {name: read_stamp(folder, name) for name in stages}
     each = {name: stamp.seconds for name, stamp in stamps.items() if stamp is not None}
     images = {"references": f"{comparison['seconds']['references'] / len(comparison['pictures']):.1f}"}
