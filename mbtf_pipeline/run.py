@@ -360,23 +360,9 @@ def survey(recipe: Recipe, folder: Path) -> dict[str, str]:
 
 
 def rerender(folder: Path, exposure: float | Literal["auto"] | None = None) -> tuple[Path, float]:
-    """Write the report of a finished run again.
-
-    Parameters
-    ----------
-    folder : folder of the run
-    exposure : exposure in EV; that of the recipe by default
-
-    Returns
-    -------
-    (Path, float)
-        HTML file, and the exposure of its images in EV.
-
-    Raises
-    ------
-    InputError : the folder contains no run of this version, or its comparison is not finished
-    UsageError : the exposure is out of range
-    """
+    """Write the report of a finished run again, at an exposure in EV, by default the recipe's; returns the
+    HTML file, and the exposure of its images. An InputError where the folder contains no run of this version,
+    or its comparison is not finished; a UsageError where the exposure is out of range."""
     RUN.read(folder)
     recipe = read_resolved(folder)
     if exposure is not None:

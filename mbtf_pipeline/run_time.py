@@ -180,12 +180,10 @@ class TimedRun:
     Parameters
     ----------
     file, assignments : recipe and ``a.b=c``, which override presets
-    seconds : total time
     folder : of the run; it stores the split, so that the same command resumes with the same one
     progress : receives lines: the split, and by how much the run will be late
     quality : the preset to use; by default the best that fits
     began : start of the run by ``time.perf_counter``; now by default
-    dry_run : write nothing
 
     Raises
     ------

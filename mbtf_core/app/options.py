@@ -265,18 +265,11 @@ class Options(Generic[S]):
         return replace(self, assignments=[*(self.assignments or ()), assignment])  # type: ignore[type-var]
 
     def resolve(self, presets: Mapping[str, Any] | None = None, **arguments: Any) -> S:
-        """The configuration: defaults, file, presets, assignments, flags.
+        """The configuration: defaults, file, presets, assignments, flags; errors are those of
+        :func:`resolve`.
 
-        Parameters
-        ----------
-        presets : dotted key → value; assignments and flags override them
-        arguments : values by key that have no flag; a path that is None here and that the file gives is
-            relative to the file, so that the file works from anywhere
-
-        Raises
-        ------
-        InputError : the file is at fault
-        UsageError : an assignment or a flag is at fault
+        `arguments` are values by key that have no flag; a path that is None here and that the file gives is
+        relative to the file, so that the file works from anywhere.
         """
         assignments = self.assignments or ()
         assigned = {text.partition("=")[0].strip() for text in assignments}
@@ -302,17 +295,9 @@ class Options(Generic[S]):
 
 
 def options_from(model: type[BaseModel], *keys: str) -> Callable[[type[C]], type[C]]:
-    """Decorator of a class of :class:`Options`: gives it a field per option, and ``--config`` and ``--set``.
-
-    Parameters
-    ----------
-    model : the configuration
-    keys : dotted keys of the options or sections that the command takes; all by default
-
-    Raises
-    ------
-    ValueError : if two of them have the same flag
-    """
+    """Decorator of a class of :class:`Options`: gives it a field per option of a configuration, by the dotted
+    keys of options or sections or of all, and ``--config`` and ``--set``; a ValueError if two have the same
+    flag."""
     table = config_options(model, *keys)
     if len({o.flag for o in table}) < len(table):
         raise ValueError(f"two options of {model.__name__} have the same flag: choose one of their keys")

@@ -209,19 +209,9 @@ def build(
     spelled: Mapping[str, str] | None = None,
     context: Any = None,
 ) -> B:
-    """Check `data` against `model`.
-
-    Parameters
-    ----------
-    source : where the data come from, for messages: a file, "command line"
-    error : class of the error to raise
-    spelled : dotted key → the flag that gave it, named in place of `source`
-    context : for the validators of `model`
-
-    Raises
-    ------
-    error : with the key, its line where `data` came from :func:`read_yaml`, and the nearest valid key
-    """
+    """Check `data` against `model`; an `error` with the key, its line where `data` came from
+    :func:`read_yaml`, and the nearest valid key. It names the source, such as a file, or the flag that gave a
+    dotted key (`spelled`); `context` is for the validators of the model."""
     try:
         return typing.cast(B, model.__pydantic_validator__.validate_python(data, context=context))
     except ValidationError as fault:
@@ -305,14 +295,12 @@ def resolve(
     ----------
     presets : dotted key → value; assignments and flags override them, value by value also where one of them
         gives a whole section
-    flags : dotted key → value; None values are flags that were not given
-    spelled : dotted key → its flag, for messages
+    flags, spelled : dotted key → value, None where it was not given; its flag, for messages
     read : reads the file
 
     Raises
     ------
-    InputError : the file is at fault
-    UsageError : an assignment or a flag is at fault
+    InputError, UsageError : the file, or an assignment or a flag is at fault
     """
     data: Any = read(file) if file is not None else {}
     switches = [(key, value) for key, value in (flags or {}).items() if value is not None]

@@ -24,16 +24,11 @@ _ABANDONED_SECONDS = 86400.0
 
 
 class FileCache:
-    """Whole files by their SHA-256, which all processes of a user share: at most `limit` bytes of them, but
-    at least the few that were fetched last.
+    """Whole files by their SHA-256 in a folder, which all processes of a user share: at most `limit` bytes of
+    them, but at least the few that were fetched last.
 
     A file is complete once it has its name. One that has changed since is read again. The files that were
     used least recently make room for new ones. A mapped file stays readable after it has been removed.
-
-    Parameters
-    ----------
-    folder : made if it is missing
-    limit : in bytes
     """
 
     def __init__(self, folder: Path, limit: float = CACHE_BYTES) -> None:
@@ -46,19 +41,9 @@ class FileCache:
         self._checked: dict[str, tuple[int, ...]] = {}
 
     def fetch(self, sha256: str, suffix: str, size: int, read: Callable[[], bytes]) -> Path:
-        """The file with a digest; read if it is missing or damaged.
-
-        Parameters
-        ----------
-        sha256, suffix, size : of the file: in hexadecimal, of its name, in bytes
-        read : returns the content
-
-        Raises
-        ------
-        InputError : what was read has another digest
-        PartialError : the disk is full
-        the errors of `read`
-        """
+        """The file of this size with a digest; ``read()`` returns its content if it is missing or damaged. An
+        InputError where that has another digest, a PartialError where the disk is full, or an error of
+        `read`."""
         path = self.folder / f"{sha256}{suffix}"
         with self._guard:
             lock = self._locks[path.name]

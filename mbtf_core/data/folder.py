@@ -92,10 +92,8 @@ class DataFolder:
 
         Raises
         ------
-        UsageError : `where` is something else
-        EngineError : the package of the protocol is not installed
-        InputError : the URL is invalid, or the store refuses the request
-        PartialError : the store cannot be reached
+        UsageError, EngineError : `where` is something else; the package of the protocol is not installed
+        InputError, PartialError : the URL is invalid, or the store refuses the request; it cannot be reached
         """
         where = getattr(where, "folder", where)
         check_type(where, (str, os.PathLike, DataFolder), "data set", "give the path or URL of its folder")
@@ -257,18 +255,9 @@ class DataFolder:
     def write_shard(
         self, name: str, write: Callable[[Path], Stored], record: Callable[[Stored], dict[str, Any]]
     ) -> dict[str, Any]:
-        """Write a shard, then its sidecar, and return the sidecar.
-
-        Parameters
-        ----------
-        write : writes the shard to a path, atomically
-        record : the sidecar, given size and digest of the shard
-
-        Raises
-        ------
-        PartialError : the disk is full; or the shard waits, because the store cannot be reached
-        InputError : the shard waits, because the store refuses it
-        """
+        """Write a shard by ``write(path)``, atomically, then its sidecar by ``record(size and digest)``, and
+        return the sidecar. A PartialError where the disk is full, or the shard waits because the store cannot
+        be reached; an InputError where it waits because the store refuses it."""
         shard, sidecar = self.workspace / name, self.workspace / sidecar_name(name)
         # If the run is killed between the two, an old sidecar would mark the new shard as finished.
         remove_file(sidecar)

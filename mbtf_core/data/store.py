@@ -117,18 +117,14 @@ class LocalStore:
 
 
 class ObjectStore:
-    """The objects of one folder of an object store; see :class:`Store`. A request whose connection drops is
-    tried again with growing pauses until the patience ends. One that is not answered is given up.
-
-    Parameters
-    ----------
-    url : such as ``s3://bucket/data``; fsspec reads credentials and endpoint from the environment
+    """The objects of one folder of an object store, such as ``s3://bucket/data``; see :class:`Store`. fsspec
+    reads credentials and endpoint from the environment. A request whose connection drops is tried again with
+    growing pauses until the patience ends. One that is not answered is given up.
 
     Raises
     ------
     EngineError : the package of the protocol is not installed
-    InputError : the URL is invalid
-    PartialError : the store does not answer
+    InputError, PartialError : the URL is invalid; the store does not answer
     """
 
     def __init__(self, url: str) -> None:
@@ -180,19 +176,9 @@ class ObjectStore:
             ) from None
 
     def _request(self, name: str, function: Callable[[], T], size: int = 0) -> T:
-        """Result of a request, tried again where the connection fails.
-
-        Parameters
-        ----------
-        name : of the object; empty for the folder
-        size : bytes that the request moves
-
-        Raises
-        ------
-        FileNotFoundError, FileExistsError : as the store says
-        InputError : the store refuses the request
-        PartialError : the store cannot be reached
-        """
+        """Result of a request for an object (the folder: empty) that moves so many bytes, tried again where
+        the connection fails. A FileNotFoundError or FileExistsError as the store says, an InputError where it
+        refuses the request, a PartialError where it cannot be reached."""
         where = f"{self.url}/{name}" if name else self.url
         pause, give_up = _FIRST_PAUSE, time.monotonic() + self.patience * (1 + size / _BLOCK_BYTES)
         failed: Exception | None = None
@@ -302,13 +288,8 @@ class ObjectStore:
 
 
 def open_store(where: str | Path) -> Store:
-    """The store of a path, or of a URL such as ``s3://bucket/data``; ``file://`` is a local path.
-
-    Raises
-    ------
-    EngineError : the package of the protocol is not installed
-    InputError : the URL is invalid
-    """
+    """The store of a path, or of a URL such as ``s3://bucket/data``; ``file://`` is a local path. Errors are
+    those of :class:`ObjectStore`."""
     url = split_url(where)
     if url is None:
         return LocalStore(Path(where))

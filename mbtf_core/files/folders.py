@@ -240,16 +240,13 @@ class OutputFolder:
 
         Parameters
         ----------
-        depends : plain data that determine the content
+        depends, digest : plain data that determine the content; digest of all that does, theirs by default
         listed : names of all files that may be written; when replaced, removed in this order
         config : resolved options, written beside the record
-        digest : of all that determines the content; by default that of `depends`
-        overwrite : remove what the folder's record lists, and start anew
 
         Raises
         ------
-        InputError : the folder holds something else
-        PartialError : it cannot be written
+        InputError, PartialError : the folder holds something else; it cannot be written
         """
         new = _Record(hash=digest or data_sha256(depends), depends=dict(depends), listed=list(listed))
         present = kind.check(path)

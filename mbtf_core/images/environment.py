@@ -33,24 +33,12 @@ _PIXELS_PER_BYTE = 16
 
 
 def read_environment(path: Path, most_rows: int) -> NDArray[np.float32]:
-    """A picture of the whole sphere, seen from inside: rows by latitude, the top one at z.
+    """A picture of the whole sphere, seen from inside: linear RGB (rows, columns, 3), at least 0, rows by
+    latitude, the top one at z. Larger pictures are averaged down to so many rows. Errors are those of
+    :func:`read_linear`.
 
     Column i of n is at azimuth 90° - 360° (i + ½) / n, as in an ``envmap`` of Mitsuba that is turned by 90°
     about x, which puts z up.
-
-    Parameters
-    ----------
-    path : EXR, HDR, PNG, JPG, TIFF or npy file; integers are sRGB, unless the file declares another space
-    most_rows : larger pictures are averaged down to so many rows
-
-    Returns
-    -------
-    (rows, columns, 3) float32 array
-        Linear RGB, at least 0.
-
-    Raises
-    ------
-    InputError : the file cannot be read
     """
     pixels = read_linear(path)
     rows = min(most_rows, pixels.shape[0])

@@ -327,19 +327,10 @@ def _codes(picture: Any, path: Path) -> NDArray[Any]:
 
 
 def gray(image: Image) -> tuple[NDArray[np.float64], list[str]]:
-    """Reduce an image to one number per pixel.
+    """One number per pixel (H, W) of an image, and warnings.
 
     RGB images become their Rec.709 luminance, with a warning where channels differ by more than the rounding
     of JPG (two 8-bit codes). Alpha is dropped, with a warning where it is not 1.
-
-    Parameters
-    ----------
-    image : Image
-
-    Returns
-    -------
-    values : (H, W) float64 array
-    warnings : list of str
     """
     pixels, warnings = image.stored, []
     if pixels.shape[2] in (2, 4) and np.any(pixels[..., -1] != image.white):
@@ -364,18 +355,9 @@ def gray(image: Image) -> tuple[NDArray[np.float64], list[str]]:
 
 
 def linear_rgb(image: Image, space: ColorSpace | None = None) -> NDArray[np.float32]:
-    """Linear Rec.709 colors of an image; gray is repeated, alpha dropped.
-
-    Parameters
-    ----------
-    image : Image
-    space : color space of the numbers; None: as the file declares, else sRGB for integers, linear for floats
-
-    Returns
-    -------
-    (H, W, 3) float32 array
-        Not clamped: colors of wider primaries may leave [0, 1].
-    """
+    """Linear Rec.709 colors (H, W, 3) of an image; gray is repeated, alpha dropped. Without a color space of
+    the numbers it is that of the file, else sRGB for integers and linear for floats. Not clamped: colors of
+    wider primaries may leave [0, 1]."""
     declared = image.tags.declared if space is None else None
     space = space or image.space
     curves = declared.curves if declared is not None else (srgb,) if space == "srgb" else ()

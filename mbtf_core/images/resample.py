@@ -23,25 +23,12 @@ _BELIEVED = (0.9, 1.05)
 def resample(
     image: NDArray[np.floating[Any]], rows: int, columns: int, enlarge: Enlargement = "linear"
 ) -> NDArray[np.floating[Any]]:
-    """Resample a periodic map, each axis separately.
+    """Resample a periodic map (H, W, ...) to (rows, columns, ...), each axis separately, in its own dtype.
 
     Fewer texels: the box filter, which preserves the mean. More texels: interpolation at the new texel
-    centers, which preserves the mean for integer factors. Edges wrap; texel centers do not shift.
-
-    Parameters
-    ----------
-    image : (H, W, ...) float array
-    rows, columns : new resolution
-    enlarge : {"linear", "cubic"}, interpolation: the tent, which stays within the range of the data, or the
-        cubic of Keys (1981) with a = -1/2, which has continuous slopes and may overshoot
-
-    Returns
-    -------
-    (rows, columns, ...) array of the same dtype
-
-    Raises
-    ------
-    ValueError : `rows` or `columns` is below 1
+    centers, which preserves the mean for integer factors: ``linear`` by the tent, which stays within the
+    range of the data, ``cubic`` by the kernel of Keys (1981) with a = -1/2, which has continuous slopes and
+    may overshoot. Edges wrap; texel centers do not shift. A ValueError where a map would be empty.
     """
     if rows < 1 or columns < 1:
         raise ValueError(f"a map needs at least one row and column, not {rows} x {columns}")
@@ -95,16 +82,8 @@ def dequantize(height: NDArray[np.float64], step: float) -> NDArray[np.float64]:
     consistent with the file. We choose, per texel, the coarsest smoothing that is consistent with rounding:
     rounding moves heights by ``step/√12`` (root mean square), and smoothing that moves them by more, locally,
     removes detail. The smoothing is a periodic Gaussian g applied as ``2g - g²``, which preserves curvature.
-    Finally, heights are clipped to half a step about the stored ones.
-
-    Parameters
-    ----------
-    height : (H, W) float64 array
-    step : distance of neighboring codes in the unit of `height`, such as 1/255 for 8-bit images
-
-    Returns
-    -------
-    (H, W) float64 array
+    Finally, heights are clipped to half a step about the stored ones. The step has the unit of the heights,
+    such as 1/255 for 8-bit images.
     """
     if not step > 0:
         raise ValueError(f"step must be positive, not {step}")

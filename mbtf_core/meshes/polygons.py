@@ -22,24 +22,17 @@ UNCUT = (
 
 @np.errstate(all="ignore")
 def triangulate(points: F64, sizes: I64) -> tuple[I64, I64, int]:
-    """Triangles between the corners of polygons.
+    """Triangles between the corners (c, 3) of polygons, one polygon after the other.
 
-    Convex polygons become fans around their first corner. Concave ones are cut into ears.
-
-    Parameters
-    ----------
-    points : (c, 3), corners of all polygons, one polygon after the other
-    sizes : (p,), number of corners of each polygon; those of fewer than three have no triangles
+    Convex polygons become fans around their first corner. Concave ones are cut into ears. Polygons of fewer
+    than three corners (`sizes`) have no triangles.
 
     Returns
     -------
-    triangles : (m, 3) int64 array
-        Corners of each triangle, in the order of the polygon.
-    polygon : (m,) int64 array
-        Polygon of each triangle, ascending.
-    uncut : int
-        Number of concave polygons that are fans too, because they cross themselves or have more than
-        ``MOST_CORNERS`` corners.
+    triangles : (m, 3) int64 array, corners of each triangle, in the order of the polygon
+    polygon : (m,) int64 array, polygon of each triangle, ascending
+    uncut : number of concave polygons that are fans too, because they cross themselves or have more than
+        ``MOST_CORNERS`` corners
     """
     first, counts = np.cumsum(sizes) - sizes, np.maximum(sizes - 2, 0)
     polygon = np.repeat(np.arange(len(sizes)), counts)

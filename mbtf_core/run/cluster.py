@@ -75,14 +75,9 @@ class DaskRunner(Runner):
             self._client.close(timeout=_LAST_SECONDS if self._fault else self._config.timeout)
 
     def wait(self, where: str) -> None:
-        """Wait for the first worker, and observe the workers from then on.
-
-        Raises
-        ------
-        InputError : none has started within the time of the configuration, or the batch system refuses the
-            jobs; names the option of `where`
-        OSError : the scheduler does not answer
-        """
+        """Wait for the first worker, and observe the workers from then on. An InputError that names the
+        option of `where` if none has started within the time of the configuration, or the batch system
+        refuses the jobs; an OSError where the scheduler does not answer."""
         limit = self._config.start_timeout
         until = time.monotonic() + limit
         self._look()
@@ -235,14 +230,9 @@ class DaskRunner(Runner):
 def open_runner(
     where: str | None, note: Callable[[str], None], otherwise: Runner | None = None
 ) -> Iterator[Runner]:
-    """A runner for the tasks of a block.
-
-    Parameters
-    ----------
-    where : ``local``, ``local:4``, a YAML file of :class:`~mbtf_core.run.workers.ClusterConfig`, or the
-        address of a scheduler; None for `otherwise`
-    note : receives lines for the user
-    otherwise : this process by default
+    """A runner for the tasks of a block: on workers ``local``, ``local:4``, of a YAML file of
+    :class:`~mbtf_core.run.workers.ClusterConfig`, or of the scheduler at an address; None for `otherwise`, by
+    default this process. `note` receives lines for the user.
 
     Raises
     ------

@@ -23,7 +23,7 @@ from mbtf_core.files.folders import ELSEWHERE, OutputKind, check_space, owned
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, worker_threads
 from mbtf_core.stats import Estimate
-from mbtf_core.units import expectation, format_duration, rounded_duration
+from mbtf_core.units import expectation, rounded_duration
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_pipeline.cost.answers import Evidence, is_significant
@@ -37,7 +37,7 @@ from mbtf_pipeline.cost.measurement import (
     combined,
     seed_deviation,
 )
-from mbtf_pipeline.cost.runs import FEWEST_TOTALS, GENERATOR, MOST_SEEDS, Run, disk_bytes, test_set
+from mbtf_pipeline.cost.runs import GENERATOR, MOST_SEEDS, Run, disk_bytes, test_set
 from mbtf_pipeline.cost.schedule import COMPILING, RESUMES, Measurements, generator_seconds
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.stages import machine
@@ -121,14 +121,6 @@ def no_run(least_run: float, least: float) -> str:
     )
 
 
-def too_short(seconds: float, least: float) -> str:
-    """Warning of a study that is too short for forecasts."""
-    return (
-        f"warning: --time {format_duration(seconds)} measures errors, but is too short to forecast others: "
-        f"complete runs of {FEWEST_TOTALS} lengths take about {rounded_duration(least)} on this machine"
-    )
-
-
 def run_study(
     recipe: Recipe,
     folder: Path,
@@ -146,32 +138,16 @@ def run_study(
 
     Parameters
     ----------
-    recipe : Recipe
-    folder : Path
-    seconds : float
-    refine : float
-        Additional seconds for repeating runs with wide error bars.
-    seed : int, optional
-        Of queries, paths and initial weights; the recipe's by default.
-    command : str
-        For the page.
-    progress : callable
-        Called with (share of the time spent, note).
-    announce : callable
-        Called with expected time and size as a line, before the first run.
-    runner : Runner, optional
-        Measures; its workers on their machines and with their threads. This process by default.
-
-    Returns
-    -------
-    Study
+    seconds, refine : time of the study, and what is added for repeating runs with wide error bars
+    seed : of queries, paths and initial weights; the recipe's by default
+    command : for the page
+    progress, announce : called with (share of the time spent, note), and with lines for the user
+    runner : measures; its workers on their machines and with their threads. This process by default
 
     Raises
     ------
-    InputError
-        The folder holds something else, there is nothing to fit, or the disk is too small.
-    PartialError
-        A worker died, or the disk is full; finished measurements are kept.
+    InputError : the folder holds something else, there is nothing to fit, or the disk is too small
+    PartialError : a worker died, or the disk is full; finished measurements are kept
     """
     start = time.perf_counter()
     runner = runner or Runner()
@@ -231,9 +207,6 @@ def run_study(
             # The first run measures how long runs and training steps take here.
             measurements.measure_runs(runs[:1], fits)
             runs = measurements.plan_runs(seconds, spp)
-            least = measurements.least_seconds(spp, setup)
-            if least is not None and seconds < least:
-                announce(too_short(seconds, least))
             measurements.measure_runs(runs, fits, MOST_SEEDS if refine else 0)
             description["taken"] = spent()
             STUDY.write(folder, description)

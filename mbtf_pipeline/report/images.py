@@ -135,13 +135,8 @@ _MAPS: dict[Palette, tuple[str, str, float]] = {
 def picture_section(
     folder: Path, comparison: Mapping[str, Any], exposure: float, gallery: Gallery
 ) -> dict[str, Any]:
-    """Lay out all images of a comparison.
-
-    Parameters
-    ----------
-    folder : of the comparison
-    exposure : of the images, in EV; errors are shown as fractions of its white
-    gallery : receives the images
+    """Lay out all images of a comparison in its folder, which `gallery` receives. Errors are shown as
+    fractions of the white of the exposure in EV.
 
     Returns
     -------

@@ -204,20 +204,9 @@ def _as_table(row: Mapping[str, str]) -> dict[str, Any]:
 
 
 def material_section(config: GeneratorConfig, inputs: Mapping[str, str]) -> dict[str, Any]:
-    """Describe the material of a data set.
-
-    Parameters
-    ----------
-    config : configuration of the data set
-    inputs : digests of the material's files when it was generated
-
-    Returns
-    -------
-    maps : a figure of each map
-    warnings : of the material and of its maps
-    inspection : text of ``mbtf-gen inspect``
-    missing : why there is nothing of it; empty otherwise
-    """
+    """Describe the material of a data set, unless its files have other digests than when it was generated:
+    ``maps``, a figure of each; ``warnings``; ``inspection``, text of ``mbtf-gen inspect``; ``missing``, why
+    there is nothing of it, empty otherwise."""
     nothing = {"maps": [], "warnings": [], "inspection": ""}
     geometry = config.geometry
     try:
