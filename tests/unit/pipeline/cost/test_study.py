@@ -28,8 +28,8 @@ from mbtf_pipeline.cost.measurement import (
     Measurement,
     MeasurementFolder,
 )
-from mbtf_pipeline.cost.runs import GENERATOR, LEAST_SECONDS, MOST_SEEDS, Run, planned_runs
-from mbtf_pipeline.cost.schedule import COMPILING, Measurements
+from mbtf_pipeline.cost.runs import MOST_SEEDS, Run
+from mbtf_pipeline.cost.schedule import Measurements
 from mbtf_pipeline.recipe import load_recipe
 
 RECIPE = ROOT / "pipelines" / "quickstart.yaml"
@@ -89,20 +89,6 @@ def test_workers_measure_the_runs_of_one_process(monkeypatch: pytest.MonkeyPatch
         assert found.failed[runs[2].label] == "training diverged at step 7"
     assert groups[0] == groups[1]
     assert [len(group) for group in groups[0]] == [MOST_SEEDS, MOST_SEEDS, 0]
-
-
-def test_the_time_of_a_study_counts_its_test_set_once_and_the_generator() -> None:
-    found = Measurements(conditions(), MemoryStore(), Runner(), path_seconds=1e-3)  # type: ignore[arg-type]
-    runs = [run(2000, "short", 60.0), run(1000, "m", 40.0)]
-    each = [r.planned_seconds(1e-3) + found.overhead for r in runs]
-    fitting, spent = found.fitting(runs, 5.0, 1e9)
-    assert fitting == runs
-    assert spent == pytest.approx(5.0 + found.test_seconds + sum(each))
-    least = found.least_run_seconds(4, 5.0)
-    assert least is not None
-    first = planned_runs(0.0, 4, 1e-3)[0]
-    needed = 5.0 + found.test_seconds + first.planned_seconds(1e-3) + found.overhead
-    assert least == pytest.approx(needed + COMPILING * GENERATOR * (least - LEAST_SECONDS))
 
 
 RUNS = [run(3000, "long", 7200.0), run(2000, "short", 60.0), run(1000, "m", 40.0)]

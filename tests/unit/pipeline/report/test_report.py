@@ -13,22 +13,8 @@ from PIL import Image
 from mbtf_core.color import palette, robust_scale, to_display
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.tile.loading import load_material
-from mbtf_pipeline.compare import timing
 from mbtf_pipeline.report.images import REDUCTIONS, linear_uri, map_uri, scaled_maps
 from mbtf_pipeline.report.sections import material_section
-
-
-def test_the_warm_up_and_an_outlier_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
-    now, costs = [0.0], iter([9.0, 0.1, 3.0, 0.2])
-
-    def work() -> str:
-        now[0] += next(costs)
-        return "value"
-
-    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
-    value, seconds = timing.timed(work)
-    assert value == "value"
-    assert seconds == pytest.approx(0.2)
 
 
 def decoded(uri: str) -> np.ndarray:
