@@ -38,13 +38,8 @@ def _age(seconds: float) -> str:
 
 
 class Lock:
-    """An acquired lock; any thread may :meth:`release` it.
-
-    Parameters
-    ----------
-    file : the lock
-    lock : of the system; None of a lock that is the file itself
-    """
+    """An acquired lock, a file, with the lock of the system; None where the lock is the file itself. Any
+    thread may :meth:`release` it."""
 
     def __init__(self, file: Path, lock: BaseFileLock | None) -> None:
         self._file, self._lock = file, lock

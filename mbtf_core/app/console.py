@@ -1,22 +1,10 @@
 """Common command-line behavior of the three programs: errors, exit codes, JSON, progress.
 
-A program defines its commands with cyclopts and passes the application to :func:`run`::
-
-    app = new_app("mbtf-fit", "Fit neural materials to multi-resolution BTF data.")
-
-    @app.default
-    def fit(shards: Path, /, *, time: str = "2min", console: Console = CONSOLE) -> None:
-        "…docstring in numpydoc style: cyclopts shows its parameters…"
-        with console.progress(total=steps, label="fitting", unit="steps") as bar:
-            bar.advance(1, note=f"loss {loss:.4f}")
-        console.report({"loss": loss}, f"loss {loss:.4f}")
-
-    sys.exit(run(app))
-
-``mbtf-fit shards/`` runs the default command, ``mbtf-fit info …`` a named one. A command returns None or an
-exit code, and raises :class:`~mbtf_core.errors.MbtfError` for every error that a user can cause.
-Results go to standard output. Progress, notes and warnings (of any logger of the packages) go to standard
-error.
+A program defines its commands with cyclopts, in an application of :func:`new_app`, and passes it to
+:func:`run`. ``mbtf-fit shards/`` runs the default command, ``mbtf-fit info …`` a named one. A command has a
+keyword parameter ``console: Console = CONSOLE``, returns None or an exit code, and raises
+:class:`~mbtf_core.errors.MbtfError` for every error that a user can cause. Results go to standard output.
+Progress, notes and warnings (of any logger of the packages) go to standard error.
 """
 
 from __future__ import annotations

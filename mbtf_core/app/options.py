@@ -120,14 +120,9 @@ Set = Annotated[
 
 @dataclass(frozen=True)
 class Flag:
-    """Metadata of a configuration's field: its option on the command line.
-
-    Attributes
-    ----------
-    name : such as ``--queries``
-    metavar : what the help shows for its value; by default the field's type
-    rare : whether few people need it: ``--help`` only names it, ``--help-all`` describes it
-    """
+    """Metadata of a configuration's field: its option on the command line, such as ``--queries``, and what
+    the help shows for its value, by default the field's type. ``--help`` only names `rare` ones,
+    ``--help-all`` describes them."""
 
     name: str
     metavar: str | None = None

@@ -19,13 +19,8 @@ _LABEL = 11
 
 
 class Progress:
-    """Progress of one job, made by :meth:`Console.progress`; this class itself shows nothing.
-
-    Attributes
-    ----------
-    total : units the job has; None where that is not known
-    done : units done so far
-    """
+    """Progress of one job, made by :meth:`Console.progress`; this class itself shows nothing. `total` is None
+    where the number of units is not known."""
 
     def __init__(self, total: float | None, label: str, unit: str) -> None:
         self.total = total

@@ -60,12 +60,7 @@ class StoredFile:
 
 
 class Store(Protocol):
-    """A folder of files, by name.
-
-    Attributes
-    ----------
-    url : path or URL, for messages
-    """
+    """A folder of files, by name; `url` is its path or URL, for messages."""
 
     url: str
 

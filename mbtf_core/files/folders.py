@@ -173,14 +173,8 @@ class _Record(BaseModel):
 
 @dataclass(frozen=True)
 class OutputKind:
-    """Kind of output, as the record in its folder states it.
-
-    Attributes
-    ----------
-    record : name of the record's file
-    format, schema : stated in the record
-    what : name of the output with its article, for messages
-    """
+    """Kind of output, as the record in its folder states it: name of the record's file, its format and
+    schema, and the name of the output with its article, for messages."""
 
     record: str
     format: str
@@ -213,10 +207,6 @@ class OutputFolder:
     """A folder that :meth:`claim` has claimed for one configuration of a command; the caller owns it.
 
     As a context manager it gives up the claim of a new folder if an error comes before the first file.
-
-    Attributes
-    ----------
-    path : Path
     """
 
     def __init__(self, path: Path, kind: OutputKind, record: _Record, *, new: bool) -> None:

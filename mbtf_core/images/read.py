@@ -139,20 +139,18 @@ def read_image(
     prefer: Callable[[str], bool] | None = None,
     max_pixels: int = MAX_PIXELS,
 ) -> Image:
-    """Decode an image file.
+    """Decode an EXR, PNG, JPG, TIFF, TGA, BMP or npy file.
 
     Parameters
     ----------
-    path : EXR, PNG, JPG, TIFF, TGA, BMP or npy file
-    channel : a channel or layer of an EXR file; R, G, B, A or Y of other formats. None: see
-        :func:`~mbtf_core.images.exr.choose_channels`
-    prefer : predicate on the layer names of an EXR file, for files of several layers
+    channel : a channel or layer of an EXR file; R, G, B, A or Y of other formats
+    prefer : as of :func:`~mbtf_core.images.exr.choose_channels`
     max_pixels : larger images are refused
 
     Raises
     ------
-    InputError : the file is missing, empty, damaged, truncated, unsupported, larger than `max_pixels`, or
-        not of the format of its suffix; the channel is missing; or pixels are NaN or infinite
+    InputError : the file is missing, empty, damaged, truncated, unsupported, or not of the format of its
+        suffix; the channel is missing; or pixels are NaN or infinite
     """
     path = Path(path)
     kind = _kind(path)

@@ -18,16 +18,9 @@ _GAMUT = 1e-3
 
 
 class Companions:
-    """Finds and reads files that a mesh names; collects them, and warnings.
+    """Finds and reads files that a mesh names, relative to its folder.
 
-    Parameters
-    ----------
-    path : the mesh; names are relative to its folder
-
-    Attributes
-    ----------
-    files : what was found, by the name that the mesh gives it
-    warnings : list of str
+    Collects them, by the name that the mesh gives them, and warnings.
     """
 
     def __init__(self, path: Path) -> None:

@@ -57,17 +57,12 @@ READ = {
 
 
 class GltfFile(Companions):
-    """A glTF document and its data, read on demand.
-
-    Parameters
-    ----------
-    path : a ``.gltf`` or ``.glb`` file; its content decides which
+    """A glTF document, ``.gltf`` or ``.glb`` by its content, and its data, read on demand.
 
     Attributes
     ----------
     document : its parts that are read
     extensions : names of all extensions that it uses, sorted
-    files, warnings : files besides `path` that were read, by name, and what is not used
 
     Raises
     ------

@@ -36,15 +36,8 @@ _USED = {"tr", *(prefix + key.lower() for key in _ROLES.values() for prefix in (
 
 @dataclass(frozen=True)
 class MtlMaterial:
-    """Statements of one material.
-
-    Attributes
-    ----------
-    name : its name
-    path : its file
-    statements : dict of str to (str, str, int); keyword, the rest of the line and its number, by keyword in
-        lower case
-    """
+    """Statements of one material of a file: keyword, the rest of the line and its number, by keyword in lower
+    case."""
 
     name: str
     path: Path

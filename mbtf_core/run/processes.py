@@ -177,12 +177,8 @@ def _end_with_parent() -> None:
 
 
 class Processes(Runner):
-    """Runs items in processes of this machine, each in one of its own: a crash ends its item alone.
-
-    Parameters
-    ----------
-    workers : number of items at a time; they divide the cores
-    """
+    """Runs items in processes of this machine, so many at a time, which divide the cores, each in one of its
+    own: a crash ends its item alone."""
 
     here = False
 

@@ -23,14 +23,8 @@ _FLIP = "-flip.png"
 
 @dataclass(frozen=True)
 class Scene:
-    """One view under one light at one width of the field of view.
-
-    Attributes
-    ----------
-    index : of the scene in the comparison, from 0
-    name : ``v1-l2-s3``: view, light and width, counted from 1
-    tiles_across : width of the field of view at the target, in tile widths
-    """
+    """One view under one light at one width of the field of view at the target, in tile widths. Its name
+    ``v1-l2-s3`` counts views, lights and widths from 1, its index in the comparison from 0."""
 
     index: int
     name: str

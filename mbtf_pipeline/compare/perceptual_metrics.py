@@ -203,14 +203,8 @@ def perceptual_scores(
 
 @dataclass(frozen=True)
 class PerceptualMetric:
-    """A perceptual metric as tables show it.
-
-    Attributes
-    ----------
-    key : ``flip.ldr`` and so on, in the comparison's record
-    title : in tables
-    best : value for equal images
-    """
+    """A perceptual metric as tables show it: its key in the comparison's record, such as ``flip.ldr``, and
+    its value for equal images."""
 
     key: str
     title: str

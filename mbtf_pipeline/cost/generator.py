@@ -116,12 +116,8 @@ class Reference:
 
 
 class GeneratorBenchmark:
-    """Measures configurations of one material against references with all effects and unlimited paths.
-
-    Parameters
-    ----------
-    config : the recipe's generator; its finest level is fixed, so that all configurations have equal queries
-    """
+    """Measures configurations of one material against references with all effects and unlimited paths. The
+    finest level is that of the recipe's generator, so that all have equal queries."""
 
     def __init__(self, config: GeneratorConfig, material: Tile) -> None:
         self.config, self.material = config, material

@@ -73,14 +73,8 @@ _STOP, _NEXT_STOP = 2.0, 2.0**0.5
 
 @dataclass(frozen=True)
 class Run(Configuration):
-    """A run to measure.
-
-    Attributes
-    ----------
-    queries, spp : training queries, and paths of each
-    fit : options of the fitter, by dotted name
-    seed : added to the study's seed, for data and fit
-    """
+    """A run to measure: its training queries, and paths of each; options of the fitter by dotted name; and
+    what is added to the study's seed, for data and fit."""
 
     queries: int
     spp: int
