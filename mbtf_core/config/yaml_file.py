@@ -41,11 +41,10 @@ def read_yaml(path: Path) -> Any:
     from ruamel.yaml.reader import ReaderError
 
     text = _text_of(path)
-    if len(text) > _MAX_CHARACTERS:
-        raise InputError(f"is too long: more than {_MAX_CHARACTERS:,} characters", where=path)
     marks = sum(text.count(mark) for mark in ("\n", ":", ","))
-    if marks > _MAX_MARKS:
-        raise InputError(f"is too long: more than {_MAX_MARKS:,} lines, colons and commas", where=path)
+    if len(text) > _MAX_CHARACTERS or marks > _MAX_MARKS:
+        what = f"more than {_MAX_CHARACTERS:,} characters, or {_MAX_MARKS:,} lines, colons and commas"
+        raise InputError(f"is too long: {what}", where=path)
     if "<<" in text and text.count("*") * marks > _MAX_MERGED:
         raise InputError("merges (<<) too many keys", where=path)
     bracket = _deep_bracket(text)

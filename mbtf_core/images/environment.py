@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mbtf_core.errors import InputError, reason
 from mbtf_core.images.color_spaces import from_chromaticities
 from mbtf_core.images.limits import MAX_PIXELS
-from mbtf_core.images.read import SUFFIXES, Image, linear_rgb, read_image
+from mbtf_core.images.read import Image, linear_rgb, read_image
 from mbtf_core.images.resample import resample
 from mbtf_core.images.tags import Tags
 from mbtf_core.paths import opened
@@ -50,14 +50,7 @@ def read_environment(path: Path, most_rows: int) -> NDArray[np.float32]:
 def read_linear(path: Path) -> NDArray[np.float32]:
     """Linear RGB (H, W, 3) of an EXR, HDR, PNG, JPG, TIFF or npy file; integers are sRGB, gray becomes RGB.
     An InputError where the file cannot be read, or a pixel is NaN or infinite."""
-    suffix = path.suffix.lower()
-    if path.is_file() and suffix not in (_RADIANCE, *SUFFIXES):
-        raise InputError(
-            f"'{path.suffix}' is not an image format that is read",
-            where=path,
-            hint=f"use one of {', '.join((_RADIANCE, *SUFFIXES))}",
-        )
-    image = read_radiance(path) if suffix == _RADIANCE else read_image(path)
+    image = read_radiance(path) if path.suffix.lower() == _RADIANCE else read_image(path)
     if image.tags.foreign is not None and image.tags.space is None:
         _log.warning("%s: its %s is not applied; convert it to sRGB", path, image.tags.foreign)
     return linear_rgb(image)

@@ -12,6 +12,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -87,16 +88,10 @@ def test_workers_that_dask_cannot_close_are_killed(monkeypatch: pytest.MonkeyPat
     other.kill()
 
 
-def scheduler_file(folder: Path, address: str) -> str:
-    """A file that names a scheduler, which must answer within a second."""
-    path = folder / "scheduler.yaml"
-    path.write_text(f"address: {address}\ntimeout: 1s\n")
-    return str(path)
-
-
 def test_a_scheduler_that_is_not_there_is_bad_input(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
-    runner = open_runner(scheduler_file(tmp_path, "tcp://127.0.0.1:9"), lambda line: None)
+    (tmp_path / "scheduler.yaml").write_text("address: tcp://127.0.0.1:9\ntimeout: 1s\n")
+    runner = open_runner(str(tmp_path / "scheduler.yaml"), lambda line: None)
     with pytest.raises(InputError, match=r"tcp://127\.0\.0\.1:9"), runner:
         pass
 
@@ -110,27 +105,36 @@ def one_worker() -> Iterator[Any]:
         yield started
 
 
-def test_a_scheduler_that_ends_leaves_resumable_work(one_worker: Any, tmp_path: Path) -> None:
-    with open_runner(scheduler_file(tmp_path, one_worker.scheduler_address), lambda line: None) as opened:
+@pytest.mark.parametrize(
+    ("option", "fault", "says"),
+    [
+        ("timeout", "ends", ""),
+        ("timeout", "hangs", "no answer within 1 s"),
+        ("start_timeout", "has no worker", "no worker within 1s"),
+    ],
+)
+def test_a_cluster_that_is_lost_leaves_resumable_work(
+    one_worker: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, option: str, fault: str, says: str
+) -> None:
+    monkeypatch.setattr(module, "_LOOK_SECONDS", 0.2)
+    answers = threading.Event()
+    begin = {
+        "ends": one_worker.close,
+        # Its connections stay open.
+        "hangs": lambda: one_worker.loop.add_callback(answers.wait),
+        "has no worker": lambda: one_worker.scale(0),
+    }
+    path = tmp_path / "scheduler.yaml"
+    path.write_text(f"address: {one_worker.scheduler_address}\n{option}: 1s\n")
+    with ExitStack() as stack:
+        # The runner closes before a hanging scheduler answers.
+        stack.callback(answers.set)
+        opened = stack.enter_context(open_runner(str(path), lambda line: None))
         results = opened.map(run_tasks.double, (Item(f"x{i}", {"x": i}) for i in range(10**6)))
         next(results)
-        one_worker.close()
-        with pytest.raises(PartialError, match="the cluster is lost"):
+        begin[fault]()
+        with pytest.raises(PartialError, match=f"the cluster is lost .*{says}"):
             list(results)
-
-
-def test_a_scheduler_that_hangs_leaves_resumable_work(one_worker: Any, tmp_path: Path) -> None:
-    """Its connections stay open."""
-    answers = threading.Event()
-    try:
-        with open_runner(scheduler_file(tmp_path, one_worker.scheduler_address), lambda line: None) as opened:
-            results = opened.map(run_tasks.double, (Item(f"x{i}", {"x": i}) for i in range(10**6)))
-            next(results)
-            one_worker.loop.add_callback(answers.wait)
-            with pytest.raises(PartialError, match=r"the cluster is lost .no answer within 1 s"):
-                list(results)
-    finally:
-        answers.set()
 
 
 def test_a_worker_with_several_threads_runs_one_task_at_a_time() -> None:
@@ -209,20 +213,6 @@ def test_an_interruption_while_waiting_for_jobs_is_one(tmp_path: Path) -> None:
         [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True
     )
     assert done.stdout == "interrupted\n", done.stderr
-
-
-def test_a_cluster_without_workers_is_not_waited_for_for_ever(
-    one_worker: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "_LOOK_SECONDS", 0.2)
-    path = tmp_path / "scheduler.yaml"
-    path.write_text(f"address: {one_worker.scheduler_address}\nstart_timeout: 1s\n")
-    with open_runner(str(path), lambda line: None) as opened:
-        results = opened.map(run_tasks.double, (Item(f"x{i}", {"x": i}) for i in range(10**6)))
-        next(results)
-        one_worker.scale(0)
-        with pytest.raises(PartialError, match=r"the cluster is lost .no worker within 1s"):
-            list(results)
 
 
 def test_local_workers_share_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
