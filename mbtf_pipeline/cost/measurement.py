@@ -115,7 +115,6 @@ class Measurement:
     error : relative RMS error of the generator's values, or unexplained variance of a fit
     bias, noise : the two parts of the generator's error; error² = bias² + noise²
     details : further numbers by name: generation and training seconds, bytes, milliseconds
-    curve : (total seconds, error) of a run that had been stopped there
     """
 
     study: str
@@ -127,7 +126,6 @@ class Measurement:
     bias: Estimate | None = None
     noise: Estimate | None = None
     details: dict[str, float] = field(default_factory=dict)
-    curve: tuple[tuple[float, float], ...] = ()
 
 
 def measure(configuration: Configuration, conditions: Conditions) -> Measurement:
@@ -170,10 +168,7 @@ class MeasurementFolder:
             data = read_json(self._path(of))
             numbers = {name: data[name] and estimate(data[name]) for name in ESTIMATES}
             command = of.command(self.conditions)
-            curve = tuple((seconds, error) for seconds, error in data["curve"])
-            return Measurement(
-                of.study, of.series, of.name, command, **numbers, details=data["details"], curve=curve
-            )
+            return Measurement(of.study, of.series, of.name, command, **numbers, details=data["details"])
         except (InputError, KeyError, TypeError):
             return None
 
@@ -181,8 +176,7 @@ class MeasurementFolder:
         """Store a measurement."""
         self.folder.mkdir(parents=True, exist_ok=True)
         numbers = {name: e and e.as_dict() for name in ESTIMATES for e in (getattr(found, name),)}
-        rest = {"details": found.details, "curve": found.curve}
-        write_json(self._path(of), {"label": of.label, **numbers, **rest})
+        write_json(self._path(of), {"label": of.label, **numbers, "details": found.details})
 
 
 def seed_deviation(groups: Iterable[Sequence[Measurement]]) -> Estimate:
@@ -199,7 +193,7 @@ def seed_deviation(groups: Iterable[Sequence[Measurement]]) -> Estimate:
 
 
 def combined(group: Sequence[Measurement], deviation: Estimate) -> Measurement:
-    """The runs of one configuration as one measurement: name, command and curve of the first one, means of
+    """The runs of one configuration as one measurement: name and command of the first one, means of
     all. The errors by the test set and by other work on the machine are common to all runs, and do not become
     less by repeats."""
     error = statistics.fmean(m.error.value for m in group)

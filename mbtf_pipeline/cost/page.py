@@ -94,8 +94,7 @@ def _figure(
 
 
 def _front_section(runs: Sequence[Measurement], evidence: Evidence, png: Path) -> dict[str, Any]:
-    """All runs and their Pareto front, the longest one while it trained, and the forecast; of a single run
-    its numbers."""
+    """All runs, their Pareto front and the forecast; of a single run its numbers."""
     front = pareto_front(runs)
     table = _table(_RUNS, front).for_page()
     if len(runs) < 2 and front:
@@ -114,9 +113,6 @@ def _front_section(runs: Sequence[Measurement], evidence: Evidence, png: Path) -
     caption = "Labels: error and total time of the runs on the Pareto front."
     bars = "their time: scatter, and what other work may have added"
     series = [_series("complete runs", runs, label=name, style="points", x_error_name=bars)]
-    if front and len(stops := front[-1].curve) > 0:
-        x, y = zip(*stops, (front[-1].seconds.value, front[-1].error.value), strict=True)
-        series.append(Series("the longest of them, if stopped early", x, y))
     if evidence.curve is not None:
         x = np.geomspace(evidence.runs[-1].seconds.value, evidence.farthest, 12).tolist()
         found = [one for seconds in x if (one := evidence.error_after(seconds)) is not None]

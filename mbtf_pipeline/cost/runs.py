@@ -4,12 +4,10 @@ All runs are evaluated on the same test set, which no fit is trained on: many qu
 highlights where these decide. With halves a, b of its values and a prediction p, ``E[(p - a)(p - b)]`` is the
 squared error of p, free of the noise of the test values. Its error bar depends on the number of queries more
 than on that of paths. Data and fits come from the generator and the fitter, called as the programs call them.
-While a run trains, the test set also gives the errors that it would have if it were stopped.
 """
 
 from __future__ import annotations
 
-import math
 import os
 import shlex
 import shutil
@@ -40,8 +38,6 @@ from mbtf_pipeline.run_time import round_down
 
 if TYPE_CHECKING:
     from mbtf_fit.data.queries import ShardQueries
-    from mbtf_fit.material.material import Material
-    from mbtf_fit.training.trainer import Trainer
 
 # Most seeds of a run.
 MOST_SEEDS = 12
@@ -67,8 +63,6 @@ _NO_QUERIES = (1, 2)
 PIXELS = 1920 * 1080
 _TIMED_QUERIES = 1 << 18
 _TIMED = 5
-# First training time after which the error of a run that is stopped is measured, and the factor to the next.
-_STOP, _NEXT_STOP = 2.0, 2.0**0.5
 
 
 @dataclass(frozen=True)
@@ -116,19 +110,16 @@ class Run(Configuration):
         options = nested({"seed": conditions.config.seed + self.seed, **self.fit})
         out = _own_folder(conditions) / f"fit-{data_sha256(self.key)[:12]}"
         shutil.rmtree(out, ignore_errors=True)
-        stops = _Stops(test)
-        result = fit(FitConfig.model_validate(options), shards, out, observe=stops)
-        error = _error(result.material, test)
-        # Of a fit without the evaluations here.
-        fit_seconds = result.total_seconds - stops.spent
-        seconds = generation_seconds + fit_seconds
+        result = fit(FitConfig.model_validate(options), shards, out)
+        error = unexplained_variance(result.material.predict(test), test.value_a, test.value_b, test.weight)
+        seconds = generation_seconds + result.total_seconds
         details = {
             "queries": float(self.queries),
             "spp": float(self.spp),
             "generation_seconds": generation_seconds,
             "training_seconds": result.seconds,
             "training_steps": float(result.history[-1]["step"]),
-            "overhead_seconds": fit_seconds - result.seconds,
+            "overhead_seconds": result.total_seconds - result.seconds,
             "total_seconds": seconds,
             "evaluation_ms_1080p": 1e3 * _evaluation_seconds(result.material, test),
             "bytes": float(sum(p.stat().st_size for p in out.glob("weights*"))),
@@ -140,31 +131,7 @@ class Run(Configuration):
         details["evaluating_seconds"] = details["run_seconds"] - seconds
         took = Estimate(seconds, 0.0, 1)
         command = self.command(conditions)
-        early = seconds - result.seconds
-        curve = tuple((early + trained, value) for trained, value in stops.found if math.isfinite(value))
-        return Measurement(
-            self.study, self.series, self.name, command, took, error, details=details, curve=curve
-        )
-
-
-class _Stops:
-    """Observes a fit: (training seconds, error) at times that grow by a factor, and the seconds it took."""
-
-    def __init__(self, test: ShardQueries) -> None:
-        self.test, self.next, self.spent = test, _STOP, 0.0
-        self.found: list[tuple[float, float]] = []
-
-    def __call__(self, record: dict[str, Any], trainer: Trainer, subset: ShardQueries) -> None:
-        if self.next <= record["seconds"] and record["fraction"] < 1.0:
-            start = time.perf_counter()
-            self.found.append((record["seconds"], _error(trainer, self.test).value))
-            self.next = record["seconds"] * _NEXT_STOP
-            self.spent += time.perf_counter() - start
-
-
-def _error(fitted: Material | Trainer, test: ShardQueries) -> Estimate:
-    """Unexplained variance of a material, or of a fit in training."""
-    return unexplained_variance(fitted.predict(test), test.value_a, test.value_b, test.weight)
+        return Measurement(self.study, self.series, self.name, command, took, error, details=details)
 
 
 def shortest_total(step_seconds: float) -> float:
