@@ -242,13 +242,6 @@ def open_runner(
     if where is None:
         yield otherwise or Runner()
         return
-    with _open_workers(where, note) as workers:
-        yield workers
-
-
-@contextlib.contextmanager
-def _open_workers(where: str, note: Callable[[str], None]) -> Iterator[DaskRunner]:
-    """Workers for the tasks of a block; see :func:`open_runner`."""
     config = read_cluster(where)
     dask, distributed = (import_extra(name, f"--cluster {where}") for name in ("dask", "distributed"))
     if config.engine != "local" and config.address is None and not has_extra("dask_jobqueue"):
@@ -276,7 +269,7 @@ def _open_workers(where: str, note: Callable[[str], None]) -> Iterator[DaskRunne
         if config.address is not None:
             note(f"cluster: connecting to {config.address}, at most {limit}")
         try:
-            started = config.address or stack.enter_context(_started(config, refused))
+            started = config.address or stack.enter_context(_workers(config, refused))
             # Dask's own time limit leaves out the first answer; its error is the better one.
             client = call_within(
                 config.timeout,
@@ -304,7 +297,7 @@ def _open_workers(where: str, note: Callable[[str], None]) -> Iterator[DaskRunne
         yield cluster
 
 
-def _started(config: ClusterConfig, refused: list[str]) -> Any:
+def _workers(config: ClusterConfig, refused: list[str]) -> Any:
     """A Dask cluster, which ends its workers when its block ends."""
     environment = {THREADS_VARIABLE: str(config.threads), "OMP_NUM_THREADS": str(config.threads)}
     if config.engine != "local":

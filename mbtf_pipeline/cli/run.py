@@ -288,7 +288,8 @@ def list_recipes(folder: Path = Path("pipelines"), /, *, console: Console = CONS
     if not folder.is_dir():
         raise InputError("no such folder", where=folder)
     found = [_entry(path) for path in sorted(folder.glob("*.y*ml"))]
-    lines = [f"{e['file']}: {e['error'] or e['description'] or e['name']}" for e in found]
+    # An error names its file.
+    lines = [e["error"] or f"{e['file']}: {e['description'] or e['name']}" for e in found]
     console.report({"recipes": found}, "\n".join(lines) or f"{folder}: no recipes")
 
 
@@ -300,10 +301,7 @@ def _entry(path: Path) -> dict[str, Any]:
         recipe = load(path)
         entry |= {"name": recipe.name, "description": recipe.description, "folder": str(recipe.folder)}
     except MbtfError as error:
-        # The recipe's path stands before the message already.
-        first = error.message.splitlines()[0]
-        rest = first.removeprefix(f"{path}:")
-        entry["error"] = f"line {rest}" if rest[:1].isdigit() and rest != first else rest.strip()
+        entry["error"] = error.message.splitlines()[0]
     return entry
 
 

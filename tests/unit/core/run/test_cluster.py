@@ -166,7 +166,7 @@ def test_what_a_job_needs_comes_beside_what_tasks_need_and_what_a_site_configure
         slurm = ClusterConfig(
             engine="slurm", options={"interface": "lo", **own}, threads=8, gpus=1, memory=16e9, walltime=7200
         )
-        with warnings.catch_warnings(), module._started(slurm, []):
+        with warnings.catch_warnings(), module._workers(slurm, []):
             warnings.simplefilter("error")
     assert job.index("module load site") < job.index(f"export {task.THREADS_VARIABLE}=8")
     assert "export DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE=False" in job
