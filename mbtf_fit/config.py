@@ -4,7 +4,7 @@ preset, see :mod:`mbtf_gen.config.generator`."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -48,10 +48,8 @@ if TYPE_CHECKING:
 else:
     ModelName = Annotated[Literal[NAMES] | str, BeforeValidator(_known)]
 
-# The best of them where the data set has a geometry.
-DEFAULT_MODEL = "relief"
-# The best of them for fibers, which have none.
-FIBER_MODEL = "neumip+"
+# The best of them for height fields, for fibers, and for data without a geometry.
+DEFAULT_MODEL, FIBER_MODEL, LEARNING_MODEL = "relief", "cloth", "neumip+"
 # Defaults of fits that share a network: each batch is of one material, so that the gradients of the network
 # scatter more (docs/results/models.md, "Shared networks").
 SHARED_PRESET: dict[str, Any] = {"training": {"batch": 1 << 14, "learning_rate": 0.01}}
@@ -175,10 +173,23 @@ _GENERAL = {
 
 
 def decoder_models() -> list[str]:
-    """Models whose network materials can share; the last one needs no geometry."""
+    """Models whose network materials can share."""
     from mbtf_fit.models.registry import with_option
 
     return sorted(with_option("decoder"), reverse=True)
+
+
+def best_model(geometries: Sequence[Collection[str]]) -> ModelName:
+    """The best model for data sets whose geometries have these channels; several share a network."""
+    from mbtf_fit.models.registry import model_class
+
+    preferred = [FIBER_MODEL, DEFAULT_MODEL, LEARNING_MODEL, "neumip"]
+    return next(
+        name
+        for name in preferred
+        if all(set(model_class(name).reads_geometry) <= {*channels} for channels in geometries)
+        and (len(geometries) == 1 or name in decoder_models())
+    )
 
 
 def build_model(name: str, lattice: Lattice, **network: Any) -> NeuralMaterial:

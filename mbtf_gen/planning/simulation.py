@@ -12,7 +12,7 @@ from mbtf_core.data.geometry import CLEARCOAT, FINEST_LEVEL, GLOSSY, Geometry
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import Queries
 from mbtf_core.images.resample import resample
-from mbtf_gen.engine.runtime import CPU_VARIANT
+from mbtf_gen.engine.runtime import CPU_VARIANT, load_mitsuba
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.effects_plan import EffectsPlan
@@ -56,8 +56,6 @@ def build_estimator(
     """
     if plan.closed_form:
         return ClosedForm(np.asarray(job.material.base_color, np.float64).reshape(-1, 3)[0])
-    from mbtf_gen.engine.runtime import load_mitsuba
-
     load_mitsuba(variant)
     from mbtf_gen.render.estimator import Estimator
     from mbtf_gen.render.path_tracer import Transport
@@ -103,11 +101,13 @@ def shading_slopes(job: Job, plan: EffectsPlan) -> NDArray[np.float64] | None:
 
 
 def geometry_of(job: Job, plan: EffectsPlan) -> Geometry | None:
-    """Geometry of a job's surface, without the effects that its plan leaves out; None for fibers, which have
-    neither heights nor slopes."""
+    """Geometry of a job's surface, without the effects that its plan leaves out; None for meshes."""
     material, grid = job.material, job.material.grid
     if grid is None:
-        return None
+        load_mitsuba()
+        from mbtf_gen.render.scene import unit_of
+
+        return material.seen_from_above(job.lattice.finest, unit_of(material.aspect))
     shape = Lattice(min(job.lattice.finest + 1, FINEST_LEVEL), grid.aspect).shape()
     x, y = np.moveaxis(_slopes(job, plan), -1, 0)
     geometry = Geometry(

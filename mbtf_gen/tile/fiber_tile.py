@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mbtf_core.data.geometry import Geometry
 from mbtf_gen.config.generator import GeometrySection
 from mbtf_gen.tile.fibers.curves import F64, Bundle, Curve
 from mbtf_gen.tile.fibers.draft import Weave
@@ -41,12 +42,19 @@ class FiberScattering:
     ior: float = 1.55
 
     @property
+    def longitudinal_variance(self) -> float:
+        """Variance of the reflected lobe along the fiber, in square radians (Chiang et al. 2016,
+        equation 7)."""
+        b = self.roughness
+        return (0.726 * b + 0.812 * b**2 + 3.7 * b**20) ** 2
+
+    @property
     def narrowest(self) -> float:
         """Standard deviation of the narrowest lobe, along or around the fiber, in radians (Chiang et al.
         2016, equations 7 and 8). Along the fiber, the transmitted lobe is half as wide as the reflected
         one."""
-        b, n = self.roughness, self.azimuthal_roughness
-        along = 0.5 * (0.726 * b + 0.812 * b**2 + 3.7 * b**20)
+        n = self.azimuthal_roughness
+        along = 0.5 * self.longitudinal_variance**0.5
         # Of a logistic distribution.
         scale = np.sqrt(np.pi / 8.0) * (0.265 * n + 1.194 * n**2 + 5.372 * n**22)
         return float(min(along, scale * np.pi / np.sqrt(3.0)))
@@ -125,6 +133,13 @@ class FiberTile(Tile):
         part = np.array([distinct.index(s) for s in self.scattering])[yarn] if len(distinct) > 1 else None
         u = (yarn + 0.5) / len(self.colors)
         return CurveGeometry.of_runs(runs, u, part, self.aspect, self.thickness, unit)
+
+    def seen_from_above(self, finest: int, unit: float) -> Geometry:
+        from mbtf_gen.tile.envelope import Envelope
+
+        seen = Envelope.of(self.trace(unit), self.aspect, unit, -self.thickness, finest)
+        variances = np.array([s.longitudinal_variance for s in self.scattering])
+        return seen.geometry(finest, self.colors, variances)
 
     @property
     def _distinct(self) -> list[FiberScattering]:
