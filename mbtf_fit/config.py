@@ -221,7 +221,7 @@ _RELIEF: _Sizes = (
     (300.0, {"network.width": 64, "network.channels": 16, "network.relief.places": 4}),
 )
 # Models that have such options.
-_MODELS: tuple[ModelName, ...] = ("relief", "neumip+", "neumip", "neumip-baseline")
+_MODELS: tuple[ModelName, ...] = ("relief", "cloth", "neumip+", "neumip", "neumip-baseline")
 
 # Fewest steps of these models. Twice as many leave 0.93 of the error or more, except on glossy materials
 # (``benchmarks/advice.py``). Two free cores take about 7 s for them; steps of other models take longer.
@@ -238,10 +238,10 @@ FITTER: dict[Quality, dict[str, Any]] = {
 
 def best_options(seconds: float, model: ModelName = DEFAULT_MODEL) -> dict[str, Any]:
     """Network and smoothing options of a model, dotted names, for a training time (seconds) on two processor
-    cores; none for a model other than `relief`, `neumip` and its baseline."""
+    cores; none for a model other than `relief`, `cloth`, `neumip` and its variants."""
     if model not in _MODELS:
         return {}
-    sizes, rest = (_RELIEF, {}) if model == "relief" else (_NEUMIP, _SMOOTH)
+    sizes, rest = (_RELIEF, {}) if model in ("relief", "cloth") else (_NEUMIP, _SMOOTH)
     return [size for least, size in sizes if seconds >= least][-1] | rest
 
 
