@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.data.geometry import Geometry
 from mbtf_gen.config.generator import GeometrySection
 from mbtf_gen.tile.fibers.curves import F64, Bundle, Curve
 from mbtf_gen.tile.fibers.draft import Weave
@@ -133,13 +132,6 @@ class FiberTile(Tile):
         part = np.array([distinct.index(s) for s in self.scattering])[yarn] if len(distinct) > 1 else None
         u = (yarn + 0.5) / len(self.colors)
         return CurveGeometry.of_runs(runs, u, part, self.aspect, self.thickness, unit)
-
-    def seen_from_above(self, finest: int, unit: float) -> Geometry:
-        from mbtf_gen.tile.envelope import Envelope
-
-        seen = Envelope.of(self.trace(unit), self.aspect, unit, -self.thickness, finest)
-        variances = np.array([s.longitudinal_variance for s in self.scattering])
-        return seen.geometry(finest, self.colors, variances)
 
     @property
     def _distinct(self) -> list[FiberScattering]:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.data.geometry import Geometry
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError, UsageError
@@ -101,11 +100,6 @@ class Tile(ABC):
         below : bool
             Whether rays may be below the surface, as behind an opacity mask.
         """
-
-    def seen_from_above(self, finest: int, unit: float) -> Geometry | None:
-        """What is known of a tile that is no height field, for data up to a level, traced with so many scene
-        units per tile width."""
-        return None
 
     def lattice(self, finest: int | None = None) -> Lattice:
         """Texel grids of the levels up to `finest`; by default up to the material's own resolution."""

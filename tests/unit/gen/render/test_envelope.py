@@ -1,4 +1,4 @@
-"""What fibers show from above: a wire's profile, directions, colors and gaps in closed form."""
+"""What fibers and meshes show from above: profiles, directions, colors, gaps and holes in closed form."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ import pytest
 from support.scenes import mi
 
 from mbtf_core.data.geometry import Geometry
-from mbtf_gen.render.scene import unit_of
+from mbtf_gen.render.envelope import seen_from_above
 from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile
 from mbtf_gen.tile.fibers.curves import Curve
+from mbtf_gen.tile.mesh_tile import MeshPart, MeshTile
+from mbtf_gen.tile.protocol import REFLECTION
 
 assert mi
 COLORS = np.array([[0.2, 0.4, 0.6], [0.8, 0.1, 0.3]])
@@ -27,7 +29,7 @@ def seen(*curves: Curve) -> Geometry:
     yarn = np.arange(len(curves)) % 2
     scattering = FiberScattering(roughness=0.2), FiberScattering(roughness=0.5)
     tile = FiberTile.settled(ASPECT, curves, yarn, COLORS, scattering)
-    return tile.seen_from_above(FINEST, unit_of(ASPECT))
+    return seen_from_above(tile, FINEST, ("transmission",))
 
 
 def test_a_straight_wire_has_its_profile_direction_and_color() -> None:
@@ -71,3 +73,48 @@ def test_diagonal_and_rising_fibers_keep_their_signs() -> None:
     rising = seen(Curve.through(arch, RADIUS, np.array([1.0, 0.0, 0.0]))).tangent_moments[8, :, 2]
     assert rising[4:12].min() > 0.1
     assert rising[20:28].max() < -0.1
+
+
+def plates(opacity: float = 1.0) -> MeshTile:
+    """A roof over the middle half of the tile, which rises by 0.1, over a floor."""
+    x = np.array([0.0, 1.0, 1.0, 0.0, 0.25, 0.75, 0.75, 0.25])
+    y = np.array([0.0, 0.0, 1.0, 1.0] * 2)
+    z = np.array([-0.2] * 4 + [-0.1, 0.0, 0.0, -0.1])
+    quad = np.array([[0, 1, 2], [0, 2, 3]])
+    floor = MeshPart("floor", {"base_color": np.array([0.1, 0.2, 0.3]), "roughness": 0.8, "specular": 0.5})
+    roof = {"base_color": np.array([0.9, 0.6, 0.3]), "roughness": 0.3, "metallic": 1.0, "opacity": opacity}
+    return MeshTile(
+        1.0,
+        np.column_stack([x, y, z]),
+        np.concatenate([quad, quad + 4]),
+        np.zeros((8, 2)),
+        np.array([0, 0, 1, 1]),
+        [floor, MeshPart("roof", roof)],
+    )
+
+
+def test_a_mesh_has_the_heights_slopes_and_layers_of_its_highest_part() -> None:
+    found = seen_from_above(plates(), FINEST, REFLECTION)
+    columns = found.heights.shape[1]
+    x = (np.arange(columns) + 0.5) / columns
+    over = (x > 0.25) & (x < 0.75)
+    wanted = np.where(over, 0.2 * (x - 0.25) - 0.1, -0.2)
+    wanted = np.broadcast_to(wanted - wanted.max(), found.heights.shape)
+    np.testing.assert_allclose(found.heights, wanted, atol=1e-5)
+    assert found.opacity is None
+    for name, below, above in (
+        ("roughness", 0.8, 0.3),
+        ("metallic", 0.0, 1.0),
+        ("specular", 0.5, 0.0),
+        ("base_color", [0.1, 0.2, 0.3], [0.9, 0.6, 0.3]),
+        ("slopes", [0.0, 0.0], [0.2, 0.0]),
+    ):
+        image = getattr(found, name)
+        np.testing.assert_allclose(image[:, [2, 16]], [[below, above]] * len(image), atol=1e-5, err_msg=name)
+
+
+def test_rays_pass_holes_of_a_mesh() -> None:
+    found = seen_from_above(plates(opacity=0.4), FINEST, REFLECTION)
+    np.testing.assert_allclose(found.heights, 0.0, atol=1e-6)
+    assert found.metallic is not None
+    assert not found.metallic.any()
