@@ -48,8 +48,8 @@ if TYPE_CHECKING:
 else:
     ModelName = Annotated[Literal[NAMES] | str, BeforeValidator(_known)]
 
-# The best of them for height fields, for fibers, and for data without a geometry.
-DEFAULT_MODEL, FIBER_MODEL, LEARNING_MODEL = "relief", "cloth", "neumip+"
+# The best of them for height fields and meshes, and for fibers.
+DEFAULT_MODEL, FIBER_MODEL = "relief", "cloth"
 # Defaults of fits that share a network: each batch is of one material, so that the gradients of the network
 # scatter more (docs/results/models.md, "Shared networks").
 SHARED_PRESET: dict[str, Any] = {"training": {"batch": 1 << 14, "learning_rate": 0.01}}
@@ -183,7 +183,7 @@ def best_model(geometries: Sequence[Collection[str]]) -> ModelName:
     """The best model for data sets whose geometries have these channels; several share a network."""
     from mbtf_fit.models.registry import model_class
 
-    preferred = [FIBER_MODEL, DEFAULT_MODEL, LEARNING_MODEL, "neumip"]
+    preferred = [FIBER_MODEL, DEFAULT_MODEL, "neumip+", "neumip"]
     return next(
         name
         for name in preferred

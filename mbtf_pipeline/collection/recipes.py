@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from mbtf_core.config.settings import FileName, Settings, build, deep_merge, distinct, resolve
 from mbtf_core.errors import InputError, MbtfError
 from mbtf_core.units import Duration
-from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL, LEARNING_MODEL
+from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL
 from mbtf_pipeline.collection.materials import find_materials, name_materials
 from mbtf_pipeline.compare.perceptual_metrics import weights_file
 from mbtf_pipeline.recipe import Name, Recipe, load_recipe, read_recipe
@@ -296,11 +296,7 @@ def load(file: Path, assignments: Sequence[str] = ()) -> Recipe | LibraryRecipe 
 
 def _model_for(path: Path) -> str:
     """The model that is best for a material."""
+    from mbtf_gen.tile.fibers.cloth_file import ClothFile
     from mbtf_gen.tile.loading import described
-    from mbtf_gen.tile.maps.material_file import MaterialFile
-    from mbtf_gen.tile.mesh_file import MeshFile
 
-    found = described(path)[0] if path.exists() else None
-    if found is None or isinstance(found, MaterialFile):
-        return DEFAULT_MODEL
-    return LEARNING_MODEL if isinstance(found, MeshFile) else FIBER_MODEL
+    return FIBER_MODEL if path.exists() and isinstance(described(path)[0], ClothFile) else DEFAULT_MODEL
