@@ -46,14 +46,15 @@ def seen_from_above(tile: Tile, finest: int, on: Collection[str]) -> Geometry:
     covered = _image(si.is_valid(), grid)
     heights = np.where(covered > 0.0, _image(si.p.z, grid) / scene.unit, -tile.thickness)
     values = _fibers(tile, si, grid) if isinstance(tile, FiberTile) else _reflectance(scene, si, grid)
-    slopes = [-_image(n, grid) for n in (si.n.x, si.n.y)]
+    nx, ny, nz = (_image(n, grid) for n in si.n)
     # Normals of tubes point down by rounding.
-    steep = np.maximum(np.maximum(_image(si.n.z, grid), np.hypot(*slopes) / _STEEPEST), 1e-3)
-    x, y = (s / steep * covered for s in slopes)
+    steep = np.maximum(np.maximum(nz, np.hypot(nx, ny) / _STEEPEST), 1e-3)
+    x, y = -nx / steep, -ny / steep
 
     def means(*channels: F64) -> NDArray[np.float32]:
-        """Means over texels of some channels (H, W)."""
-        out = resample(np.stack(channels, -1), *Lattice(level, tile.aspect).shape())
+        """Means over texels of some channels (H, W), which are 0 in gaps."""
+        seen = np.stack([np.where(covered > 0.0, channel, 0.0) for channel in channels], -1)
+        out = resample(seen, *Lattice(level, tile.aspect).shape())
         return np.asarray(out if len(channels) > 1 else out[..., 0], np.float32)
 
     return Geometry(
@@ -62,7 +63,7 @@ def seen_from_above(tile: Tile, finest: int, on: Collection[str]) -> Geometry:
         means(x, y),
         means(x * x, x * y, y * y),
         opacity=None if covered.all() else means(covered).clip(0.0, 1.0),
-        **{name: means(*(covered * channel for channel in found)) for name, found in values.items()},
+        **{name: means(*channels) for name, channels in values.items()},
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.scenes import mi
@@ -118,3 +120,16 @@ def test_rays_pass_holes_of_a_mesh() -> None:
     np.testing.assert_allclose(found.heights, 0.0, atol=1e-6)
     assert found.metallic is not None
     assert not found.metallic.any()
+
+
+def test_gaps_of_a_mesh_are_deep_flat_and_black() -> None:
+    whole = plates()
+    roof = replace(whole, faces=whole.faces[2:], part=whole.part[2:])
+    found = seen_from_above(roof, FINEST, REFLECTION)
+    assert found.opacity is not None
+    np.testing.assert_allclose(found.opacity.mean(), 0.5, atol=1e-6)
+    gap = found.opacity == 0.0
+    for image in (found.slopes, found.slope_moments, found.base_color, found.roughness):
+        assert image is not None
+        assert not image[gap].any()
+    assert found.heights.min() == pytest.approx(-0.1, abs=2e-3)
