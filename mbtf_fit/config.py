@@ -4,7 +4,7 @@ preset, see :mod:`mbtf_gen.config.generator`."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -48,10 +48,8 @@ if TYPE_CHECKING:
 else:
     ModelName = Annotated[Literal[NAMES] | str, BeforeValidator(_known)]
 
-# The best of them where the data set has a geometry.
-DEFAULT_MODEL = "relief"
-# The best of them for fibers, which have none.
-FIBER_MODEL = "neumip+"
+# The best of them for height fields and meshes, and for fibers.
+DEFAULT_MODEL, FIBER_MODEL = "relief", "cloth"
 # Defaults of fits that share a network: each batch is of one material, so that the gradients of the network
 # scatter more (docs/results/models.md, "Shared networks").
 SHARED_PRESET: dict[str, Any] = {"training": {"batch": 1 << 14, "learning_rate": 0.01}}
@@ -175,10 +173,23 @@ _GENERAL = {
 
 
 def decoder_models() -> list[str]:
-    """Models whose network materials can share; the last one needs no geometry."""
+    """Models whose network materials can share."""
     from mbtf_fit.models.registry import with_option
 
     return sorted(with_option("decoder"), reverse=True)
+
+
+def best_model(geometries: Sequence[Collection[str]]) -> ModelName:
+    """The best model for data sets whose geometries have these channels; several share a network."""
+    from mbtf_fit.models.registry import model_class
+
+    preferred = [FIBER_MODEL, DEFAULT_MODEL, "neumip+", "neumip"]
+    return next(
+        name
+        for name in preferred
+        if all(set(model_class(name).reads_geometry) <= {*channels} for channels in geometries)
+        and (len(geometries) == 1 or name in decoder_models())
+    )
 
 
 def build_model(name: str, lattice: Lattice, **network: Any) -> NeuralMaterial:
@@ -210,7 +221,7 @@ _RELIEF: _Sizes = (
     (300.0, {"network.width": 64, "network.channels": 16, "network.relief.places": 4}),
 )
 # Models that have such options.
-_MODELS: tuple[ModelName, ...] = ("relief", "neumip+", "neumip", "neumip-baseline")
+_MODELS: tuple[ModelName, ...] = ("relief", "cloth", "neumip+", "neumip", "neumip-baseline")
 
 # Fewest steps of these models. Twice as many leave 0.93 of the error or more, except on glossy materials
 # (``benchmarks/advice.py``). Two free cores take about 7 s for them; steps of other models take longer.
@@ -227,10 +238,10 @@ FITTER: dict[Quality, dict[str, Any]] = {
 
 def best_options(seconds: float, model: ModelName = DEFAULT_MODEL) -> dict[str, Any]:
     """Network and smoothing options of a model, dotted names, for a training time (seconds) on two processor
-    cores; none for a model other than `relief`, `neumip` and its baseline."""
+    cores; none for a model other than `relief`, `cloth`, `neumip` and its variants."""
     if model not in _MODELS:
         return {}
-    sizes, rest = (_RELIEF, {}) if model == "relief" else (_NEUMIP, _SMOOTH)
+    sizes, rest = (_RELIEF, {}) if model in ("relief", "cloth") else (_NEUMIP, _SMOOTH)
     return [size for least, size in sizes if seconds >= least][-1] | rest
 
 

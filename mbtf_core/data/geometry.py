@@ -31,10 +31,16 @@ FINEST_LEVEL = 11
 HEIGHTS, MAPS = "heights", "maps"
 _ASPECT = "mbtf.aspect"
 # Attributes of Geometry whose channels have other names.
-_ATTRIBUTES = {"height": "heights", "slope": "slopes", "slope_moment": "slope_moments"}
+_ATTRIBUTES = {
+    "height": "heights",
+    "slope": "slopes",
+    "slope_moment": "slope_moments",
+    "tangent_moment": "tangent_moments",
+}
 # Of each group all or none are stored.
 GLOSSY = ("roughness", "metallic", "specular")
 CLEARCOAT = ("clearcoat", "clearcoat_roughness")
+FIBERS = ("tangent_moments", "longitudinal_variance")
 
 
 @dataclass(frozen=True)
@@ -58,6 +64,9 @@ class Geometry:
         In [0, 1]; None for an opaque surface.
     clearcoat, clearcoat_roughness : (h, w) float32 array or None
         In [0, 1], weight and roughness of the coat; both are None for a surface without.
+    tangent_moments, longitudinal_variance : (h, w, 6) and (h, w) float32 arrays or None
+        Of the fibers seen from above: means of the products ``xx, xy, xz, yy, yz, zz`` of their directions,
+        and of the variance of their lobe in square radians, 0 in gaps; None where there are no fibers.
     """
 
     heights: F32
@@ -71,6 +80,8 @@ class Geometry:
     opacity: F32 | None = None
     clearcoat: F32 | None = None
     clearcoat_roughness: F32 | None = None
+    tangent_moments: F32 | None = None
+    longitudinal_variance: F32 | None = None
 
     @classmethod
     def of_heights(cls, heights: F32, aspect: float) -> Geometry:
@@ -212,6 +223,6 @@ def _check(geometry: Geometry, path: Path) -> None:
         raise InputError("the maximum of 'height' is not 0", where=path)
     if geometry.slope_moments[..., (0, 2)].min() < 0:
         raise InputError("'slope_moment' holds negative means of squares", where=path)
-    for group in (GLOSSY, CLEARCOAT):
+    for group in (GLOSSY, CLEARCOAT, FIBERS):
         if len({getattr(geometry, name) is None for name in group}) > 1:
             raise InputError(f"has some, but not all, of {', '.join(group)}", where=path)

@@ -136,7 +136,12 @@ ARRAY: dict[str, ArraySpec] = {a.name: a for a in ARRAYS}
 CLEARCOAT_F0 = 0.04
 # Images of `GEOMETRY_NAME`. Means are over a texel; the optional ones are left out where they do not apply.
 GEOMETRY: tuple[ArraySpec, ...] = (
-    _array("height", "", "tile widths", "height z <= 0 of the mesh at its vertices, maximum 0"),
+    _array(
+        "height",
+        "",
+        "tile widths",
+        "height z <= 0 of the mesh at its vertices, maximum 0; of fibers, as seen from above",
+    ),
     _array("slope", "x y", "rise per length", "mean slopes dz/dx and dz/dy of the shading normal"),
     _array("slope_moment", "xx xy yy", "(rise per length)^2", "means of the products of these slopes"),
     _array("base_color", "R G B", "1", "mean base color (linear Rec.709 RGB)", optional=True),
@@ -146,6 +151,20 @@ GEOMETRY: tuple[ArraySpec, ...] = (
     _array("opacity", "", "1", "mean opacity", optional=True),
     _array("clearcoat", "", "1", "mean weight of the clear coat, whose F0 is 4%", optional=True),
     _array("clearcoat_roughness", "", "1", "mean roughness of the clear coat", optional=True),
+    _array(
+        "tangent_moment",
+        "xx xy xz yy yz zz",
+        "unit vector^2",
+        "means of the products of the fibers' directions as seen from above, 0 in gaps",
+        optional=True,
+    ),
+    _array(
+        "longitudinal_variance",
+        "",
+        "rad^2",
+        "mean variance of the reflected lobe along the fiber (Chiang et al. 2016, equation 7), 0 in gaps",
+        optional=True,
+    ),
 )
 
 CONVENTIONS: dict[str, str] = {

@@ -30,7 +30,7 @@ from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import expectation
 from mbtf_fit.cli.advice import advise
 from mbtf_fit.cli.live import Live, live_view
-from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL, FitConfig, ModelName, decoder_models
+from mbtf_fit.config import DEFAULT_MODEL, FitConfig, ModelName, best_model
 from mbtf_fit.formatting import describe_fit, fits_table
 
 if TYPE_CHECKING:
@@ -248,12 +248,10 @@ def _model_for(shards: Sequence[Path | DataFolder]) -> ModelName:
     from mbtf_core.data.dataset import Dataset
 
     try:
-        known = all(Dataset.open(folder).manifest["geometry"] is not None for folder in shards)
+        records = [Dataset.open(folder).manifest["geometry"] or {} for folder in shards]
     except InputError:  # the fit refuses it, with the reason
-        known = True
-    if known:
         return DEFAULT_MODEL
-    return FIBER_MODEL if len(shards) == 1 else decoder_models()[-1]
+    return best_model([record.get("channels", ()) for record in records])
 
 
 def _fit_many(

@@ -252,6 +252,26 @@ class NumpyMaterial:
             hints.append(np.array([irradiance, *n[:2], *core]))
         return np.mean(hints, 0)
 
+    def fiber_frame(self, hits, level, omega_i, omega_o, maps, finer, least_tangents, least_cosine,
+                    least_variance):  # fmt: skip
+        found, h = [], omega_i + omega_o
+        for hit in hits.reshape(-1, 2):
+            known = self.lookup(hit, level + finer, maps)
+            t, v = known[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]], known[6]
+            c = max(0, np.trace(t))
+            mean = axis = t / max(c, least_tangents)
+            for _ in range(3):
+                axis = axis @ axis / max(np.trace(axis @ axis), 1e-12)
+            si, so = (np.clip(w @ axis @ w, 0, 1) for w in (omega_i, omega_o))
+            both = omega_i @ axis @ omega_o
+            cosines = max(np.sqrt((1 - si) * (1 - so)), least_cosine)
+            off = si + so + 2 * both
+            spread = max(0, h @ mean @ h - off * np.trace(mean @ axis))
+            w = max(v / max(c, least_tangents) + spread, least_variance)
+            lobe = c * np.exp(-off / (2 * w)) / np.sqrt(2 * np.pi * w)
+            found.append([lobe, np.clip((omega_i @ omega_o - both) / cosines, -1, 1), si, so, both, c])
+        return np.mean(found, 0)
+
     def lobe(
         self,
         base_color,

@@ -19,7 +19,7 @@ horizons, which take longer to filter, follow less often.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from mbtf_fit.models.model import PYRAMID, Preparation
@@ -68,7 +68,7 @@ class LearnedRelief(Relief):
             ],
         },
     }
-    traces_geometry = False
+    reads_geometry: ClassVar[Sequence[str]] = ()
     takes = (*PYRAMID, *(f"network.relief.{name}" for name in ("hints", "frame", "gate")))
     learned = "heights"
 

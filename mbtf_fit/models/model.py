@@ -75,7 +75,7 @@ class Model:
     layout : of the data that it is trained on
     defaults : options that differ from the general defaults, nested
     takes : the options of :data:`SPECIAL` that it has; others are refused
-    traces_geometry : whether the data must have a geometry
+    reads_geometry : channels that the data's geometry must have, by which users tell it
     calibrates : whether energy calibration follows the training
     """
 
@@ -84,7 +84,7 @@ class Model:
     layout: ClassVar[Layout] = "shuffled"
     defaults: ClassVar[Mapping[str, Any]] = {}
     takes: ClassVar[Sequence[str]] = PYRAMID
-    traces_geometry: ClassVar[bool] = False
+    reads_geometry: ClassVar[Sequence[str]] = ()
     calibrates: ClassVar[bool] = True
 
     def __init__(self, material: NeuralMaterial) -> None:

@@ -13,7 +13,7 @@ surface's single scattering, scaled by a learned gate:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -21,11 +21,21 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_fit.models.model import PYRAMID, SHARED, Model, Preparation
 from mbtf_fit.models.neumip import color, encode_directions, encode_position, hidden_layers, pyramid
 from mbtf_fit.ops import Displace, Gate, Network, Operation, Rotate, Shade, Trace, Transform
-from mbtf_fit.ops.constants import DIELECTRIC, HEIGHTS, HORIZONS, IRRADIANCE_SCALE, LIGHT_WIDTH, MAPS, PLACES
+from mbtf_fit.ops.constants import (
+    DIELECTRIC,
+    FIBER_HINTS,
+    HEIGHTS,
+    HINTS,
+    HORIZONS,
+    IRRADIANCE_SCALE,
+    LIGHT_WIDTH,
+    MAPS,
+    PLACES,
+)
 from mbtf_fit.sections import NetworkSection
 
-# Bytes of a training query in memory, and of its hints.
-QUERY_BYTES, HINT_BYTES = 48, 28
+# Bytes of a training query in memory, and of each of its hints.
+QUERY_BYTES, HINT_BYTES = 48, 4
 
 
 class Relief(Model):
@@ -43,7 +53,7 @@ class Relief(Model):
         # Oversampled texels see a quarter of the queries each: with a decay of 1, glossy materials overfit.
         "training": {"texture_weight_decay": 2.0, "blur": {"min_sigma": 1.6}},
     }
-    traces_geometry = True
+    reads_geometry: ClassVar[Sequence[str]] = ("height",)
     takes = (*PYRAMID, *SHARED, *(f"network.relief.{n}" for n in ("places", "hints", "frame", "gate")))
     # Texture of learned heights, in models that have one.
     learned: ClassVar[str | None] = None
@@ -53,7 +63,7 @@ class Relief(Model):
         relief = network.relief
         encoded, position = encode_position("u", network.encoding)
         light_and_view, directions = encode_directions(network.encoding)
-        hints, known = surface_inputs(network)
+        hints, known = cls.surface_inputs(network)
         core = "surface[3:6]"
         outputs = network.output_channels
         return [
@@ -84,6 +94,23 @@ class Relief(Model):
             ),
         ]
 
+    @classmethod
+    def surface_inputs(cls, network: NetworkSection) -> tuple[list[Operation], list[str]]:
+        """Operations on hints (irradiance, normal, core), and the inputs of the decoder that they give."""
+        out: list[Operation] = []
+        names: list[str] = []
+        if network.relief.hints:
+            out += [
+                Transform("log_irradiance", "surface[0:1]", "log1p", scale=IRRADIANCE_SCALE),
+                Transform("log_core", "surface[3:6]", "log1p", divisor="unit"),
+            ]
+            names += ["log_irradiance", "surface[1:3]", "log_core"]
+        if network.relief.frame:
+            axis = "surface[1:3]"
+            out += [Rotate("light_there", axis, "omega_i"), Rotate("view_there", axis, "omega_o")]
+            names += ["light_there", "view_there"]
+        return out, names
+
     def prepare(self, given: Preparation) -> Any:
         from mbtf_fit.surface.known import KnownSurface
 
@@ -93,7 +120,8 @@ class Relief(Model):
         return given.queries
 
     def precompute(self, queries: Any, memory: float) -> Any:
-        if not hasattr(queries, "hints") or len(queries) * (QUERY_BYTES + HINT_BYTES) > memory:
+        hints = HINTS if self.material.fiber_frame is None else HINTS + FIBER_HINTS
+        if not hasattr(queries, "hints") or len(queries) * (QUERY_BYTES + HINT_BYTES * hints) > memory:
             return queries
         return self._with_hints(queries)
 
@@ -115,20 +143,3 @@ def known_surface(places: int) -> tuple[Trace, Shade]:
     trace = Trace("z", "hits", "u", "level", "omega_o", HEIGHTS, offsets)
     tensors = MAPS, HORIZONS, LIGHT_WIDTH, DIELECTRIC
     return trace, Shade("surface", "hits", "level", "omega_i", "omega_o", *tensors, finer)
-
-
-def surface_inputs(network: NetworkSection) -> tuple[list[Operation], list[str]]:
-    """Operations on hints (irradiance, normal, core), and the inputs of the decoder that they give."""
-    out: list[Operation] = []
-    names: list[str] = []
-    if network.relief.hints:
-        out += [
-            Transform("log_irradiance", "surface[0:1]", "log1p", scale=IRRADIANCE_SCALE),
-            Transform("log_core", "surface[3:6]", "log1p", divisor="unit"),
-        ]
-        names += ["log_irradiance", "surface[1:3]", "log_core"]
-    if network.relief.frame:
-        axis = "surface[1:3]"
-        out += [Rotate("light_there", axis, "omega_i"), Rotate("view_there", axis, "omega_o")]
-        names += ["light_there", "view_there"]
-    return out, names

@@ -19,7 +19,7 @@ MAX_CHANNELS, MAX_WIDTH, MAX_LAYERS, MAX_LEVELS, MAX_PLACES = 64, 128, 16, 16, 4
 
 _I32, _I64, _F32, _POINTER = ctypes.c_int32, ctypes.c_int64, ctypes.c_float, ctypes.c_void_p
 # Version of what the functions mean, where sizes of structures do not show it; as in src/kernel.h.
-INTERFACE = 7
+INTERFACE = 8
 
 
 class NetworkStruct(ctypes.Structure):
@@ -47,7 +47,7 @@ class ModelStruct(ctypes.Structure):
         *((name, NetworkStruct) for name in ("decoder", "offset")),
         *((name, _F32) for name in ("unit", "most", "offset_scale", "grazing", "aspect")),
         *((name, _F32) for name in ("irradiance_scale", "height_scale", "least_facing")),
-        *((name, _I32) for name in ("coordinates", "half_vector", "hints", "frame", "gate")),
+        *((name, _I32) for name in ("coordinates", "half_vector", "hints", "frame", "fibers", "gate")),
         ("depth_weights", _POINTER),
     )
 
@@ -73,12 +73,13 @@ class SurfaceStruct(ctypes.Structure):
 
     _fields_ = (
         ("heightfield", Heightfield),
-        *((name, TexturesStruct) for name in ("maps", "horizons")),
+        *((name, TexturesStruct) for name in ("maps", "horizons", "fibers")),
         ("places", _I32),
         ("offsets", _F32 * (2 * MAX_PLACES)),
         *((name, _F32) for name in ("finer", "light_width", "light_blur", "dielectric")),
         *((name, _F32) for name in ("edge", "coat", "least_view")),
         *((name, _F32 * 2) for name in ("albedo_spread", "alpha2", "voigt")),
+        *((name, _F32) for name in ("fiber_finer", "least_tangents", "least_cosine", "least_spread")),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mbtf_fit.ops.fibers import FiberFrame
 from mbtf_fit.ops.lookup import Displace, Lookup, Neighborhood, Offset, SurfaceMaps, Trace
 from mbtf_fit.ops.network import (
     Frequencies,
@@ -22,6 +23,7 @@ __all__ = [
     "Calibrate",
     "Displace",
     "DivideByCosine",
+    "FiberFrame",
     "Frequencies",
     "Gate",
     "HalfVector",

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_fit import ops
-from mbtf_fit.ops.constants import DIELECTRIC, HEIGHTS, HORIZONS, LIGHT_WIDTH, MAPS
+from mbtf_fit.ops.constants import DIELECTRIC, FIBERS, HEIGHTS, HINTS, HORIZONS, LIGHT_WIDTH, MAPS
 from mbtf_fit.ops.operation import needed_for, output_names, parse, reached_from, sizes_of
 from mbtf_fit.ops.value import calibrated
 from mbtf_fit.pytorch.networks import InceptionDecoder, Mlp, initialize_layers
@@ -24,7 +24,7 @@ from mbtf_fit.surface.known import KnownSurface
 # Standard deviation of the initial features; weight of the traced displacement before training.
 FEATURE_SCALE, FIRST_WEIGHT = 0.1, 0.9
 # Operations that read the surface.
-_SURFACE = (ops.Trace, ops.Shade, ops.SurfaceMaps)
+_SURFACE = (ops.Trace, ops.Shade, ops.SurfaceMaps, ops.FiberFrame)
 # Tensor of the calibration factors.
 CALIBRATION = "calibration"
 # Bound of learned values that have none, in units.
@@ -162,13 +162,14 @@ class NeuralMaterial(nn.Module):
     def forward(
         self, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor, hints: Tensor | None = None
     ) -> Tensor:
-        """Value (n, 3) in 1/sr, not clamped; `hints` (n, 7) of a surface are computed where they are not
-        given."""
+        """Value (n, 3) in 1/sr, not clamped; `hints` of a surface are computed where they are not given."""
         given = self._given(u, sigma, omega_i, omega_o)
         if self.tracing is not None:
             trace, shade = self.tracing
             hints = self.hints(u, sigma, omega_i, omega_o) if hints is None else hints
-            given |= {trace.output: hints[:, :1], shade.output: hints[:, 1:]}
+            given |= {trace.output: hints[:, :1], shade.output: hints[:, 1:HINTS]}
+            if self.fiber_frame is not None:
+                given[self.fiber_frame.output] = hints[:, HINTS:]
         return self.run([self.operations[-1].output], given)[0]
 
     def evaluate_patches(self, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
@@ -235,11 +236,18 @@ class NeuralMaterial(nn.Module):
         shade = next((op for op in self._own if isinstance(op, ops.Shade)), None)
         return None if trace is None or shade is None else (trace, shade)
 
+    @property
+    def fiber_frame(self) -> ops.FiberFrame | None:
+        """The operation that reads the fibers of the surface, if there is one."""
+        return next((op for op in self._own if isinstance(op, ops.FiberFrame)), None)
+
     def know(self, surface: KnownSurface) -> None:
-        """Set heights and maps of the surface, without levels that no lookup reaches."""
+        """Set heights and maps of the surface, without what no lookup reaches."""
         finer = self.tracing is not None and self.tracing[1].finer > 0
-        reached = surface.maps[: self.lattice.finest + 1 + finer]
-        self.surface = surface if len(reached) == len(surface.maps) else replace(surface, maps=reached)
+        levels = self.lattice.finest + 1 + finer
+        fibers = () if self.fiber_frame is None else surface.fibers[:levels]
+        reached = len(surface.maps) == levels and len(surface.fibers) == len(fibers)
+        self.surface = surface if reached else replace(surface, maps=surface.maps[:levels], fibers=fibers)
 
     @property
     def known(self) -> KnownSurface:
@@ -248,10 +256,11 @@ class NeuralMaterial(nn.Module):
         return self.surface
 
     def hints(self, u: Tensor, sigma: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        """Height and shading (n, 7) of the surface that queries see."""
+        """Height and shading (n, 7) of the surface that queries see, and directions about its fibers (n, 6)
+        where they are read."""
         assert self.tracing is not None
         with torch.no_grad():
-            return compute_hints(self.known, *self.tracing, u, sigma, omega_i, omega_o)
+            return compute_hints(self.known, *self.tracing, self.fiber_frame, u, sigma, omega_i, omega_o)
 
     @property
     def bounds(self) -> set[str]:
@@ -396,7 +405,7 @@ def _behind(operations: Sequence[ops.Operation], reference: str) -> set[str]:
 
 def _check_surface(operations: Sequence[ops.Operation]) -> None:
     """A material has one surface, whose tensors have fixed names."""
-    surface = {HEIGHTS, MAPS, HORIZONS, LIGHT_WIDTH, DIELECTRIC}
+    surface = {HEIGHTS, MAPS, HORIZONS, LIGHT_WIDTH, DIELECTRIC, FIBERS}
     for op in operations:
         other = {*op.named("tensor"), *op.named("texture")} - surface if isinstance(op, _SURFACE) else None
         if other:

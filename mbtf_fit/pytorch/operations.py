@@ -171,6 +171,13 @@ def _ggx(
     return fresnel(f0, half, omega_o) * facets / (2.0 * (masking(light) + masking(view)) * light * view)
 
 
+@PYTORCH.implements(ops.FiberFrame)
+def _fiber_frame(
+    op: ops.FiberFrame, run: Execution, hits: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor
+) -> Tensor:
+    return run.material.known.about_fibers(op, hits, level, omega_i, omega_o)
+
+
 @PYTORCH.implements(ops.Lobe)
 def _lobe(
     op: ops.Lobe,

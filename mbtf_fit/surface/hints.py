@@ -17,7 +17,8 @@ from mbtf_fit.native.library import (
     TexturesStruct,
     kernel,
 )
-from mbtf_fit.ops.constants import ALBEDO_SPREAD, HINTS, VOIGT_SCALE, VOIGT_WIDENING
+from mbtf_fit.ops.constants import ALBEDO_SPREAD, FIBER_HINTS, HINTS, VOIGT_SCALE, VOIGT_WIDENING
+from mbtf_fit.ops.fibers import FiberFrame
 from mbtf_fit.ops.lookup import Trace
 from mbtf_fit.ops.shade import Shade, grazing_reflectance
 from mbtf_fit.surface.known import KnownSurface
@@ -40,40 +41,48 @@ def compute_hints(
     surface: KnownSurface,
     trace: Trace,
     shade: Shade,
+    fibers: FiberFrame | None,
     u: Tensor,
     sigma: Tensor,
     omega_i: Tensor,
     omega_o: Tensor,
 ) -> Tensor:
-    """Results of both operations for queries.
+    """Results of the operations for queries.
 
     Parameters
     ----------
-    trace, shade : the operations
+    trace, shade, fibers : the operations
     u, sigma, omega_i, omega_o : (n, 2), (n,), (n, 3), (n, 3) tensors, position in uv, footprint in tile
         widths, light and view
 
     Returns
     -------
-    (n, 7) tensor
-        Height, irradiance, normal (x, y), core (RGB).
+    (n, 7) tensor, or (n, 13) with fibers
+        Height, irradiance, normal (x, y), core (RGB), directions about the fibers.
     """
-    found = kernel()
+    native = kernel()
     finest, places = surface.lattice.finest, len(trace.places)
-    if found is None or u.device.type != "cpu" or finest + 2 > MAX_LEVELS or places > MAX_PLACES:
+    if native is None or u.device.type != "cpu" or finest + 2 > MAX_LEVELS or places > MAX_PLACES:
         level = (-torch.log2(2.0 * sigma)).clamp(0.0, float(finest))
         parts = []
         for start in range(0, len(u), _CHUNK):
             c = slice(start, start + _CHUNK)
             height, hits = surface.intersections(trace, u[c], level[c], omega_o[c])
-            seen = surface.shading(shade, hits, level[c], omega_i[c], omega_o[c])
-            parts.append(torch.cat([height, seen], 1))
+            found = [height, surface.shading(shade, hits, level[c], omega_i[c], omega_o[c])]
+            if fibers is not None:
+                found.append(surface.about_fibers(fibers, hits, level[c], omega_i[c], omega_o[c]))
+            parts.append(torch.cat(found, 1))
         return torch.cat(parts)
     arrays = [a.detach().float().contiguous() for a in (u, sigma, omega_i, omega_o)]
-    out = torch.empty(len(u), HINTS)
+    columns = HINTS if fibers is None else HINTS + FIBER_HINTS
+    out = torch.empty(len(u), columns)
     description = SurfaceStruct(heightfield=surface.tracer.description)
     describe_textures(*surface.map_table, description.maps)
     describe_textures(*surface.horizon_table, description.horizons)
+    if fibers is not None:
+        describe_textures(*surface.fiber_table, description.fibers)
+        description.fiber_finer, description.least_tangents = fibers.finer, fibers.least_tangents
+        description.least_cosine, description.least_spread = fibers.least_cosine, fibers.least_variance
     description.places, description.finer = places, shade.finer
     description.offsets[: 2 * places] = [x for offset in trace.places for x in offset]
     description.light_width, description.light_blur = surface.light_width, shade.light_blur
@@ -85,8 +94,8 @@ def compute_hints(
     def task(start: int) -> None:
         addresses = (a.data_ptr() + 4 * start * a.stride(0) for a in arrays)
         queries = QueryPointers(min(_TASK, len(u) - start), *addresses)
-        to = out.data_ptr() + 4 * start * HINTS
-        found.library.mbtf_hints(
+        to = out.data_ptr() + 4 * start * columns
+        native.library.mbtf_hints(
             ctypes.byref(description), ctypes.byref(queries), float(finest), trace.crossings, to
         )
 

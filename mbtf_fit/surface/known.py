@@ -24,6 +24,8 @@ from mbtf_fit.ops.constants import (
     AZIMUTHS,
     COATED_CHANNELS,
     DIELECTRIC,
+    FIBER_CHANNELS,
+    FIBERS,
     GLOSSY_CHANNELS,
     HEIGHTS,
     HORIZONS,
@@ -31,6 +33,7 @@ from mbtf_fit.ops.constants import (
     MAP_CHANNELS,
     MAPS,
 )
+from mbtf_fit.ops.fibers import FiberFrame
 from mbtf_fit.ops.lookup import Trace
 from mbtf_fit.ops.shade import Shade, grazing_reflectance
 from mbtf_fit.surface.facets import (
@@ -46,6 +49,7 @@ from mbtf_fit.surface.facets import (
     shown,
     slope_density,
 )
+from mbtf_fit.surface.fibers import fiber_frame, fiber_maps
 from mbtf_fit.surface.heightfield import DeviceCopies, HeightfieldTracer
 from mbtf_fit.surface.lookup import Packing, lookup
 from mbtf_fit.surface.slopes import slope_distributions
@@ -75,6 +79,8 @@ class KnownSurface:
         Prefiltered horizon angles in radians by level, then their squares: levels 0 to k.
     light_width : RMS angle per axis of the light kernel, in radians
     dielectric : F0 of the surface where it is no metal
+    fibers : tuple of (rows, columns, 7) tensors
+        Prefiltered maps of fibers by level, like `maps`; none for a surface without fibers.
     """
 
     lattice: Lattice
@@ -83,6 +89,7 @@ class KnownSurface:
     horizons: tuple[Tensor, ...]
     light_width: float
     dielectric: float
+    fibers: tuple[Tensor, ...] = ()
 
     @classmethod
     def of(cls, geometry: Geometry, lattice: Lattice, light_width: float) -> KnownSurface:
@@ -100,6 +107,7 @@ class KnownSurface:
             angles = torch.from_numpy(np.asarray(resample(angles.numpy(), rows, columns), np.float32))
         finer = Lattice(lattice.finest + 1, lattice.aspect)
         horizons = torch.cat([angles, angles.square()], -1)
+        fibers = fiber_maps(geometry)
         return cls(
             lattice,
             torch.from_numpy(geometry.heights.copy()),
@@ -107,6 +115,7 @@ class KnownSurface:
             tuple(prefiltered_levels(horizons, lattice)),
             math.radians(light_width),
             DIELECTRIC_F0 * float(np.mean(0.0 if geometry.specular is None else geometry.specular)),
+            () if fibers is None else tuple(prefiltered_levels(fibers, finer)),
         )
 
     def with_heights(self, heights: Tensor) -> KnownSurface:
@@ -125,6 +134,7 @@ class KnownSurface:
             DIELECTRIC: torch.tensor(self.dielectric),
             **{f"{MAPS}.{level}": t for level, t in enumerate(self.maps)},
             **{f"{HORIZONS}.{level}": t for level, t in enumerate(self.horizons)},
+            **{f"{FIBERS}.{level}": t for level, t in enumerate(self.fibers)},
         }
 
     @classmethod
@@ -144,16 +154,16 @@ class KnownSurface:
         channels = tensors[f"{MAPS}.0"].shape[-1:]
         if tuple(channels) not in {(n,) for n in MAP_CHANNELS}:
             raise ValueError(f"'{MAPS}.0'")
+        stored = range(finer.finest + (f"{MAPS}.{finer.finest}" in tensors))
+        fibers = stored if f"{FIBERS}.0" in tensors else ()
         return cls(
             lattice,
             heights,
-            tuple(
-                _take(tensors, f"{MAPS}.{s}", (*finer.shape(s), *channels))
-                for s in range(finer.finest + (f"{MAPS}.{finer.finest}" in tensors))
-            ),
+            tuple(_take(tensors, f"{MAPS}.{s}", (*finer.shape(s), *channels)) for s in stored),
             tuple(_take(tensors, f"{HORIZONS}.{s}", (*lattice.shape(s), 2 * AZIMUTHS)) for s in levels),
             float(_take(tensors, LIGHT_WIDTH, ())),
             float(_take(tensors, DIELECTRIC, ())),
+            tuple(_take(tensors, f"{FIBERS}.{s}", (*finer.shape(s), FIBER_CHANNELS)) for s in fibers),
         )
 
     @property
@@ -182,6 +192,15 @@ class KnownSurface:
         return _packed(self.horizons)
 
     @cached_property
+    def fiber_table(self) -> tuple[Tensor, Packing]:
+        """All levels of the maps of fibers, one after the other."""
+        return _packed(self.fibers)
+
+    @cached_property
+    def _fiber_copies(self) -> DeviceCopies:
+        return DeviceCopies(self.fiber_table[0])
+
+    @cached_property
     def _map_copies(self) -> DeviceCopies:
         return DeviceCopies(self.map_table[0])
 
@@ -207,6 +226,14 @@ class KnownSurface:
     def read_maps(self, hit: Tensor, level: Tensor) -> Tensor:
         """All numbers of the maps (n, channels) at surface points (n, 2); levels (n,)."""
         return lookup(self._map_copies.on(hit.device), self.map_table[1], hit, level)
+
+    def about_fibers(
+        self, op: FiberFrame, hits: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor
+    ) -> Tensor:
+        """Directions about the fibers (n, 6): means over the intersections (n, 2·places)."""
+        table, packing = self._fiber_copies.on(hits.device), self.fiber_table[1]
+        maps = (lookup(table, packing, hit, level + op.finer) for hit in hits.split(2, 1))
+        return torch.stack([fiber_frame(op, found, omega_i, omega_o) for found in maps]).mean(0)
 
     def shading(self, shade: Shade, hits: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
         """Irradiance, normal (x, y) and core (RGB) (n, 6): means over the intersections (n, 2·places)."""

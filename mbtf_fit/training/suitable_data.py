@@ -31,11 +31,13 @@ def open_data(folder: str | Path | DataFolder, model: str, cache: float | None =
             if data.estimates == 2
             else "measured data have no other layout; choose another model: --model neumip+",
         )
-    if needs.traces_geometry and data.manifest["geometry"] is None:
+    record = data.manifest["geometry"]
+    if missing := [name for name in needs.reads_geometry if name not in (record or {}).get("channels", {})]:
+        lacks = "no geometry" if record is None else f"no '{missing[0]}' in its geometry"
         raise InputError(
-            f"the data set has no geometry, which {model} traces",
+            f"the data set has {lacks}, which {model} reads",
             where=data.folder,
-            hint="fit a model that learns heights: --model neumip+",
+            hint=f"fit another model: --model {'neumip+' if record is None else 'relief'}",
         )
     return data
 

@@ -12,7 +12,7 @@ from mbtf_core.data.geometry import CLEARCOAT, FINEST_LEVEL, GLOSSY, Geometry
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import Queries
 from mbtf_core.images.resample import resample
-from mbtf_gen.engine.runtime import CPU_VARIANT
+from mbtf_gen.engine.runtime import CPU_VARIANT, load_mitsuba
 from mbtf_gen.job import Job
 from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.effects_plan import EffectsPlan
@@ -56,8 +56,6 @@ def build_estimator(
     """
     if plan.closed_form:
         return ClosedForm(np.asarray(job.material.base_color, np.float64).reshape(-1, 3)[0])
-    from mbtf_gen.engine.runtime import load_mitsuba
-
     load_mitsuba(variant)
     from mbtf_gen.render.estimator import Estimator
     from mbtf_gen.render.path_tracer import Transport
@@ -65,7 +63,7 @@ def build_estimator(
     from mbtf_gen.sampling.light_kernel import LightKernel
 
     tiles = {} if tiles is None else tiles
-    key = frozenset(name for name in plan.names_on if EFFECTS[name].alters_tile)
+    key = _of_tile(plan)
     if key not in tiles:
         tiles[key] = build_scene(job.material, job.material.surface(key, shading_slopes(job, plan)))
     transport = Transport(
@@ -75,6 +73,11 @@ def build_estimator(
         **{effect.switch: plan.on(name) for name, effect in EFFECTS.items() if effect.switch},
     )
     return Estimator(tiles[key], LightKernel(job.config.light.width), transport)
+
+
+def _of_tile(plan: EffectsPlan) -> frozenset[str]:
+    """Names of the effects that are on and change the tile."""
+    return frozenset(name for name in plan.names_on if EFFECTS[name].alters_tile)
 
 
 def pilot_queries(job: Job, count: int, shard: int = 0, lights: int = 1) -> Queries:
@@ -102,12 +105,14 @@ def shading_slopes(job: Job, plan: EffectsPlan) -> NDArray[np.float64] | None:
     return residual + np.asarray(resample(slopes, *residual.shape[:2]), np.float64)
 
 
-def geometry_of(job: Job, plan: EffectsPlan) -> Geometry | None:
-    """Geometry of a job's surface, without the effects that its plan leaves out; None for fibers, which have
-    neither heights nor slopes."""
+def geometry_of(job: Job, plan: EffectsPlan) -> Geometry:
+    """Geometry of a job's surface, without the effects that its plan leaves out."""
     material, grid = job.material, job.material.grid
     if grid is None:
-        return None
+        load_mitsuba()
+        from mbtf_gen.render.envelope import seen_from_above
+
+        return seen_from_above(material, job.lattice.finest, _of_tile(plan))
     shape = Lattice(min(job.lattice.finest + 1, FINEST_LEVEL), grid.aspect).shape()
     x, y = np.moveaxis(_slopes(job, plan), -1, 0)
     geometry = Geometry(

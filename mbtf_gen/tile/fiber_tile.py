@@ -41,12 +41,19 @@ class FiberScattering:
     ior: float = 1.55
 
     @property
+    def longitudinal_variance(self) -> float:
+        """Variance of the reflected lobe along the fiber, in square radians (Chiang et al. 2016,
+        equation 7)."""
+        b = self.roughness
+        return (0.726 * b + 0.812 * b**2 + 3.7 * b**20) ** 2
+
+    @property
     def narrowest(self) -> float:
         """Standard deviation of the narrowest lobe, along or around the fiber, in radians (Chiang et al.
         2016, equations 7 and 8). Along the fiber, the transmitted lobe is half as wide as the reflected
         one."""
-        b, n = self.roughness, self.azimuthal_roughness
-        along = 0.5 * (0.726 * b + 0.812 * b**2 + 3.7 * b**20)
+        n = self.azimuthal_roughness
+        along = 0.5 * self.longitudinal_variance**0.5
         # Of a logistic distribution.
         scale = np.sqrt(np.pi / 8.0) * (0.265 * n + 1.194 * n**2 + 5.372 * n**22)
         return float(min(along, scale * np.pi / np.sqrt(3.0)))

@@ -285,10 +285,8 @@ def load(file: Path, assignments: Sequence[str] = ()) -> Recipe | LibraryRecipe 
 
 
 def _model_for(path: Path) -> str:
-    """The model that is best for a material; that of heights traces them."""
+    """The model that is best for a material."""
+    from mbtf_gen.tile.fibers.cloth_file import ClothFile
     from mbtf_gen.tile.loading import described
-    from mbtf_gen.tile.maps.material_file import MaterialFile
 
-    if not path.exists() or isinstance(described(path)[0], MaterialFile):
-        return DEFAULT_MODEL
-    return FIBER_MODEL
+    return FIBER_MODEL if path.exists() and isinstance(described(path)[0], ClothFile) else DEFAULT_MODEL

@@ -46,10 +46,11 @@ def geometry(
     metallic: float = 0.0,
     specular: float = 0.5,
     clearcoat: tuple[float, float] | None = None,
+    fibers: bool = False,
     seed: int | None = None,
 ) -> Geometry:
     """Geometry of heights with constant maps; random maps with a `seed`. A clear coat has weight and
-    roughness."""
+    roughness. Two fibers of random directions, or a gap, lie in each texel."""
     shape = Lattice(lattice.finest + 1, lattice.aspect).shape()
     random = np.random.default_rng(seed)
 
@@ -63,7 +64,15 @@ def geometry(
     maps = {} if roughness is None else {n: varied(np.asarray(v)) for n, v in glossy.items()}
     if clearcoat is not None:
         maps |= {n: varied(np.asarray(v)) for n, v in zip(CLEARCOAT, clearcoat, strict=True)}
-    return Geometry(heights, lattice.aspect, slopes, moments, base_color=varied(np.asarray(color)), **maps)
+    base = varied(np.asarray(color))
+    if fibers:
+        t = random.standard_normal((2, *shape, 3))
+        t *= (random.random((*shape, 1)) > 0.2) / np.linalg.norm(t, axis=-1, keepdims=True)
+        products = np.einsum("fhwi,fhwj->hwij", t, t)[..., [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]] / 2
+        moments_of_fibers = products.astype(np.float32)
+        maps["tangent_moments"] = moments_of_fibers
+        maps["longitudinal_variance"] = 0.1 * moments_of_fibers[..., [0, 3, 5]].sum(-1)
+    return Geometry(heights, lattice.aspect, slopes, moments, base_color=base, **maps)
 
 
 def rough_surface(lattice: Lattice, *, glossy: bool = True, coated: bool = False) -> KnownSurface:
@@ -72,5 +81,5 @@ def rough_surface(lattice: Lattice, *, glossy: bool = True, coated: bool = False
     layers: dict[str, Any] = {"clearcoat": (1.0, 0.5)} if coated else {}
     if glossy:
         layers |= {"roughness": 0.4, "metallic": 0.7}
-    given = geometry(lattice, heights, **layers, seed=0)
+    given = geometry(lattice, heights, **layers, fibers=True, seed=0)
     return KnownSurface.of(given, lattice, 5.0)

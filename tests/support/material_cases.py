@@ -41,6 +41,7 @@ CASES: dict[str, dict[str, Any]] = {
         **net(relief={"gate": False, "frame": False}, output_channels=6),
     },
     "learned heights": {"model": "neumip+"},
+    "cloth": {"model": "cloth", "glossy": False, **net(relief={"places": 2})},
     "black": {"model": "relief", "weights": {"unit": torch.zeros(())}},
     "bounded": {"model": "relief", "weights": {"most": torch.tensor(0.5)}},
     "rainer2019": {"model": "rainer2019"},

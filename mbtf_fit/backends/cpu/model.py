@@ -94,7 +94,7 @@ class NativeModel:
         d.aspect = material.lattice.aspect
         d.coordinates, d.half_vector = pattern.coordinates, pattern.half_vector
         d.irradiance_scale = pattern.irradiance_scale
-        d.hints, d.frame, d.gate = pattern.hints, pattern.frame, pattern.gate
+        d.hints, d.frame, d.fibers, d.gate = pattern.hints, pattern.frame, pattern.fibers, pattern.gate
         if pattern.offset is not None:
             d.offset_scale, d.grazing = pattern.offset.scale, pattern.offset.grazing
         if pattern.displace is not None and pattern.displace.learned is not None:

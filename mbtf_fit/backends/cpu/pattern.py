@@ -2,7 +2,7 @@
 
 The kernel is one fused loop over queries. It evaluates lists of this form, whatever model they are of::
 
-    [trace, shade] [offset | displace] lookup [half vector, difference vector] [hints] [frame]
+    [trace, shade] [offset | displace] lookup [half vector, difference vector] [hints] [frame] [fibers]
     network transform [gate]
 
 and factors of calibration behind it, which are multiplied to its values.
@@ -21,6 +21,9 @@ T = TypeVar("T", bound=ops.Operation)
 # Inputs of the decoder for light and view, and how many coordinates of each these are.
 _LIGHTS = {("omega_i[0:2]", "omega_o[0:2]"): 2, ("omega_i", "omega_o"): 3}
 
+# What is read of a query about the surface.
+_READ = {"level": "level", "omega_i": "omega_i", "omega_o": "omega_o"}
+
 
 @dataclass(frozen=True)
 class Pattern:
@@ -32,7 +35,7 @@ class Pattern:
     offset, offset_network : the neural offset, or None
     displace : displacement by traced heights, or None
     coordinates : of light and of view that the decoder reads
-    half_vector, hints, frame : whether it reads those
+    half_vector, hints, frame, fibers : whether it reads those
     irradiance_scale : factor of the irradiance under the logarithm
     unit, most : tensors of the unit and of the bound
     gate : whether the value has a gated core
@@ -48,6 +51,7 @@ class Pattern:
     half_vector: bool
     hints: bool
     frame: bool
+    fibers: bool
     irradiance_scale: float
     unit: str
     most: str
@@ -110,9 +114,13 @@ class _Matcher:
             axis = self._take(rest.pop(0), ops.HalfVector).output
             self._take(rest.pop(0) if rest else "", ops.Rotate, axis=axis, omega="omega_i")
         displace, offset, network = self._moved(lookup.u)
+        fibers = bool(rest) and self._is(rest[-1], ops.FiberFrame)
+        about = rest.pop() if fibers else ""
         hints, scale, frame = False, 1.0, len(rest) in (2, 5)
         if displace is not None:
-            shade = self._surface(displace)
+            shade, hits = self._surface(displace)
+            if fibers:
+                self._take(about, ops.FiberFrame, hits=hits, **_READ)
             if len(rest) >= 3:
                 hints, scale = True, self._hints(rest, shade, unit)
                 del rest[:3]
@@ -125,7 +133,7 @@ class _Matcher:
         # An operation that nothing above reads changes nothing, but its form is not known.
         self._expect(not rest, not self._unused)
         return Pattern(
-            *(lookup, decoder, offset, network, displace, _LIGHTS[light, view], half, hints, frame),
+            *(lookup, decoder, offset, network, displace, _LIGHTS[light, view], half, hints, frame, fibers),
             *(scale, unit, most, gate is not None, tuple(factors)),
         )
 
@@ -141,14 +149,13 @@ class _Matcher:
         self._take(network.x[0], ops.Lookup, u="u", level=None)
         return None, offset, network
 
-    def _surface(self, displace: ops.Displace) -> str:
-        """Name of the shading of the surface that the displacement is traced to."""
+    def _surface(self, displace: ops.Displace) -> tuple[str, str]:
+        """Names of the shading of the surface that the displacement is traced to, and of intersections."""
         trace = self._take(displace.z, ops.Trace, u="u", level="level", omega_o="omega_o")
         shades = [name for name in self._by_output if self._is(name, ops.Shade)]
         self._expect(len(shades) == 1)
-        read = {"level": "level", "omega_i": "omega_i", "omega_o": "omega_o"}
-        self._take(shades[0], ops.Shade, hits=trace.hits, least_variance=LEAST_VARIANCE, **read)
-        return shades[0]
+        self._take(shades[0], ops.Shade, hits=trace.hits, least_variance=LEAST_VARIANCE, **_READ)
+        return shades[0], trace.hits
 
     def _hints(self, rest: Sequence[str], shade: str, unit: str) -> float:
         """Factor of the irradiance under the logarithm."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from mbtf_core.errors import InputError
-from mbtf_fit.backends.mitsuba import lookup, network, shade
+from mbtf_fit.backends.mitsuba import fibers, lookup, network, shade
 from mbtf_fit.backends.mitsuba.backend import MITSUBA, Arithmetic, Loader, Numbers, Step
 from mbtf_fit.backends.mitsuba.frame import Frame
 from mbtf_fit.backends.mitsuba.mixture import Mixture
@@ -21,6 +21,9 @@ from mbtf_fit.ops import Operation, Shade, Trace, stages
 from mbtf_fit.ops.operation import SAMPLER, output_names
 from mbtf_fit.ops.sampler import sampler_sizes
 from mbtf_gen.engine.types import Color3f, Float, Point2f, Vector3f
+
+# Operations of files that nothing here names.
+__all__ = ["Evaluator", "Values", "fibers"]
 
 # Values by name.
 Values = dict[str, Numbers]

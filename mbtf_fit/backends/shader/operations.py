@@ -136,6 +136,31 @@ def _shade(op: ops.Shade, code: Code, hits: Value, level: Value, omega_i: Value,
     return Value.of(hints, 3, code.lit) + Value.of(sum_, 3, code.lit)
 
 
+@SHADER.implements(ops.FiberFrame)
+def _fiber_frame(
+    op: ops.FiberFrame, code: Code, hits: Value, level: Value, omega_i: Value, omega_o: Value
+) -> Value:
+    code.include("textures")
+    code.include("fibers")
+    maps, count = code.image(op.maps), len(hits) // 2
+    with code.stage_of(hits, level):
+        fibers = code.variable("Fibers", "fibers", count, kept=True)
+        for k in range(count):
+            pair = code.pair(maps, f"{level} + {number(op.finer)}", str(hits[2 * k : 2 * k + 2]))
+            code.write(f"{fibers}[{k}] = fibers_at({maps}, {pair}, {number(op.least_tangents)});")
+    sums = [code.variable("float3", op.output) for _ in range(2)]
+    bounds = f"{number(op.least_cosine)}, {number(op.least_variance)}"
+    code.write(
+        *(f"{name} = float3(0.0, 0.0, 0.0);" for name in sums),
+        f"for (int k = 0; k < {count}; k++) {{",
+        f"  AboutFibers found = about_fibers({fibers}[k], {omega_i}, {omega_o}, {bounds});",
+        f"  {sums[0]} += found.first / {number(count)};",
+        f"  {sums[1]} += found.last / {number(count)};",
+        "}",
+    )
+    return Value.of(sums[0], 3, code.lit) + Value.of(sums[1], 3, code.lit)
+
+
 @SHADER.implements(ops.Lobe)
 def _lobe(
     op: ops.Lobe,

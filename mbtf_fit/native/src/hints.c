@@ -53,7 +53,7 @@ static void find(const mbtf_textures *t, float level, float u, float v, place *p
 /* Where a view ray meets the surface: rows that are read there. */
 typedef struct {
     float z;
-    place maps, horizons;
+    place maps, horizons, fibers;
 } hit;
 
 /* Ask for a place's rows ahead of their use. */
@@ -233,6 +233,59 @@ static void shade(const mbtf_surface *s, const hit *h, const float *i, const flo
     for (int c = 0; c < 3; c++) sum[3 + c] += core[c];
 }
 
+/* Symmetric 3 x 3 matrix: xx, xy, xz, yy, yz, zz. */
+typedef struct {
+    float m[6];
+} tensor;
+
+static float trace(const tensor *a) { return a->m[0] + a->m[3] + a->m[5]; }
+
+/* x' a y */
+static float bilinear(const tensor *a, const float *x, const float *y) {
+    const float *m = a->m;
+    return m[0] * x[0] * y[0] + m[3] * x[1] * y[1] + m[5] * x[2] * y[2] + m[1] * (x[0] * y[1] + x[1] * y[0]) +
+           m[2] * (x[0] * y[2] + x[2] * y[0]) + m[4] * (x[1] * y[2] + x[2] * y[1]);
+}
+
+/* Product of matrices that commute. */
+static tensor product(const tensor *a, const tensor *b) {
+    const float *m = a->m, *n = b->m;
+    return (tensor){{m[0] * n[0] + m[1] * n[1] + m[2] * n[2], m[0] * n[1] + m[1] * n[3] + m[2] * n[4],
+                     m[0] * n[2] + m[1] * n[4] + m[2] * n[5], m[1] * n[1] + m[3] * n[3] + m[4] * n[4],
+                     m[1] * n[2] + m[3] * n[4] + m[4] * n[5], m[2] * n[2] + m[4] * n[4] + m[5] * n[5]}};
+}
+
+/* Adds directions about the fibers at a surface point. */
+static void about_fibers(const mbtf_surface *s, const hit *h, const float *i, const float *o, float *sum) {
+    float found[7] = {0};
+    for (int k = 0; k < 8; k++)
+        for (int c = 0; c < 7; c++) found[c] += h->fibers.weights[k] * s->fibers.table[h->fibers.rows[k] * 7 + c];
+    const float all = found[0] + found[3] + found[5], coverage = all > 0.0f ? all : 0.0f;
+    const float covered = coverage > s->least_tangents ? coverage : s->least_tangents;
+    tensor mean, axis;
+    for (int c = 0; c < 6; c++) mean.m[c] = found[c] / covered;
+    axis = mean;
+    for (int k = 0; k < 3; k++) {
+        axis = product(&axis, &axis);
+        const float size = trace(&axis);
+        for (int c = 0; c < 6; c++) axis.m[c] /= size > 1e-12f ? size : 1e-12f;
+    }
+    const float half[3] = {i[0] + o[0], i[1] + o[1], i[2] + o[2]};
+    const float light = clamped(bilinear(&axis, i, i), 0.0f, 1.0f), view = clamped(bilinear(&axis, o, o), 0.0f, 1.0f);
+    const float both = bilinear(&axis, i, o), cosines = sqrtf((1.0f - light) * (1.0f - view));
+    const float apart = i[0] * o[0] + i[1] * o[1] + i[2] * o[2] - both, off = light + view + 2.0f * both;
+    const tensor shared = product(&mean, &axis);
+    const float spread = bilinear(&mean, half, half) - off * trace(&shared);
+    float variance = found[6] / covered + (spread > 0.0f ? spread : 0.0f);
+    variance = variance > s->least_spread ? variance : s->least_spread;
+    sum[0] += coverage * expf(-0.5f * off / variance) / sqrtf(2.0f * PI * variance);
+    sum[1] += clamped(apart / (cosines > s->least_cosine ? cosines : s->least_cosine), -1.0f, 1.0f);
+    sum[2] += light;
+    sum[3] += view;
+    sum[4] += both;
+    sum[5] += coverage;
+}
+
 /* Traces one view ray of a query. */
 static void meet(const mbtf_surface *s, const mbtf_queries *q, int64_t k, int p, float top, int32_t most, hit *h) {
     const float aspect = s->heightfield.aspect, *u = q->u + 2 * k, *o = q->omega_o + 3 * k;
@@ -248,28 +301,32 @@ static void meet(const mbtf_surface *s, const mbtf_queries *q, int64_t k, int p,
     const float t = h->z / o[2], at = level + s->finer;
     find(&s->maps, at, x + t * o[0], y + t * o[1] / aspect, &h->maps);
     find(&s->horizons, at, x + t * o[0], y + t * o[1] / aspect, &h->horizons);
+    if (s->fibers.levels) find(&s->fibers, level + s->fiber_finer, x + t * o[0], y + t * o[1] / aspect, &h->fibers);
 }
 
-/* Hints (n, HINTS) of queries; `top` is the finest level of the data. Rows of some queries are on their way from
+/* Hints (n, HINTS) of queries, with fibers (n, HINTS + FIBER_HINTS); `top` is the finest level of the data. Rows of some queries are on their way from
  * memory while the rays of others are traced. */
 EXPORT void mbtf_hints(const mbtf_surface *s, const mbtf_queries *q, float top, int32_t most, float *out) {
     hit hits[AHEAD];
     const int64_t places = s->places, rays = q->n * places;
+    const int columns = s->fibers.levels ? HINTS + FIBER_HINTS : HINTS;
     for (int64_t ray = 0; ray < rays + AHEAD; ray++) {
         hit *h = hits + ray % AHEAD;
         if (ray >= AHEAD) {
             const int64_t before = ray - AHEAD, k = before / places;
-            float *to = out + HINTS * k;
+            float *to = out + columns * k;
             if (before % places == 0)
-                for (int c = 0; c < HINTS; c++) to[c] = 0.0f;
+                for (int c = 0; c < columns; c++) to[c] = 0.0f;
             to[0] += h->z;
             shade(s, h, q->omega_i + 3 * k, q->omega_o + 3 * k, to + 1);
+            if (s->fibers.levels) about_fibers(s, h, q->omega_i + 3 * k, q->omega_o + 3 * k, to + HINTS);
             if (before % places == places - 1)
-                for (int c = 0; c < HINTS; c++) to[c] /= (float)places;
+                for (int c = 0; c < columns; c++) to[c] /= (float)places;
         }
         if (ray >= rays) continue;
         meet(s, q, ray / places, (int)(ray % places), top, most, h);
         prefetch(&s->maps, &h->maps);
         prefetch(&s->horizons, &h->horizons);
+        if (s->fibers.levels) prefetch(&s->fibers, &h->fibers);
     }
 }

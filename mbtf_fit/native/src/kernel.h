@@ -10,7 +10,7 @@
 #include <stdint.h>
 
 /* Version of what the functions mean; raised where sizes of structures do not show a change. */
-#define INTERFACE 7
+#define INTERFACE 8
 #define BLOCK 128
 #define MAX_CHANNELS 64
 #define MAX_WIDTH 128
@@ -18,6 +18,8 @@
 #define MAX_LEVELS 16
 #define MAX_PLACES 4
 #define HINTS 7
+/* Directions about fibers, which follow the hints of surfaces that have some. */
+#define FIBER_HINTS 6
 /* Floats that a vector register may hold at most; a weight's gradient is kept as so many partial sums. */
 #define LANES 16
 
@@ -41,13 +43,13 @@ typedef struct {
 /* Operations that mbtf_fit/backends/cpu/pattern.py matches: a neural offset unless offset.layers is 0, or traced heights
  * where depth_weights (a number per level) are given. Where height_scale is not 0, the offset texture holds learned heights over height_scale, in one
  * channel. The decoder sees so many coordinates of light and of view: 2 (x, y) or 3; then, where they are not 0,
- * half vector and difference vector, hints, light and view about the known normal. With `gate`, its last output
- * is that of the gate. */
+ * half vector and difference vector, hints, light and view about the known normal, directions about fibers. With
+ * `gate`, its last output is that of the gate. */
 typedef struct {
     mbtf_textures pyramid, offset_texture;
     mbtf_network decoder, offset;
     float unit, most, offset_scale, grazing, aspect, irradiance_scale, height_scale, least_facing;
-    int32_t coordinates, half_vector, hints, frame, gate;
+    int32_t coordinates, half_vector, hints, frame, fibers, gate;
     const float *depth_weights;
 } mbtf_model;
 
@@ -63,16 +65,18 @@ float mbtf_height(const mbtf_heightfield *f, float u, float v, const float *omeg
 
 /* What is known of a surface, see mbtf_fit/surface/known.py: heights, filtered maps and horizons, places of a
  * footprint (offsets x, y in sigma), levels by which lookups are finer there, RMS angle per axis of the light,
- * reflectances of the dielectric (along the normal, and grazing) and of the clear coat, constants of R6 and R8. */
+ * reflectances of the dielectric (along the normal, and grazing) and of the clear coat, constants of R6 and R8. Where
+ * `fibers` has levels, bounds of the coverage, of cosines and of the variance (mbtf_fit/ops/fibers.py). */
 typedef struct {
     mbtf_heightfield heightfield;
-    mbtf_textures maps, horizons;
+    mbtf_textures maps, horizons, fibers;
     int32_t places;
     float offsets[2 * MAX_PLACES];
     float finer, light_width, light_blur, dielectric, edge, coat, least_view, albedo_spread[2], alpha2[2], voigt[2];
+    float fiber_finer, least_tangents, least_cosine, least_spread;
 } mbtf_surface;
 
-/* u (n, 2), sigma (n), omega_i and omega_o (n, 3), hints (n, HINTS) for relief. */
+/* u (n, 2), sigma (n), omega_i and omega_o (n, 3), hints (n, HINTS) for relief, with fibers (n, HINTS + FIBER_HINTS). */
 typedef struct {
     int64_t n;
     const float *u, *sigma, *omega_i, *omega_o, *hints;

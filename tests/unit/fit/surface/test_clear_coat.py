@@ -65,7 +65,7 @@ def known(light: F64, view: F64, scatter: F64 = SCATTER, **maps: Any) -> F64:
         m[..., 2:5] += torch.from_numpy(scatter[[0, 0, 1], [0, 1, 1]])
     queries = [torch.from_numpy(a.astype(np.float32)) for a in (light, view)]
     u, sigma = torch.full((PAIRS, 2), 0.3), torch.full((PAIRS,), 0.1)
-    found = compute_hints(replace(surface, maps=levels), *known_surface(1), u, sigma, *queries)
+    found = compute_hints(replace(surface, maps=levels), *known_surface(1), None, u, sigma, *queries)
     return found[:, 4].double().numpy()
 
 

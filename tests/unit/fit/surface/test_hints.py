@@ -43,7 +43,7 @@ def compiled(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def hints_of(known: KnownSurface, *queries: Tensor, places: int) -> Tensor:
-    return compute_hints(known, *known_surface(places), *queries)
+    return compute_hints(known, *known_surface(places), None, *queries)
 
 
 def surface(**options: Any) -> KnownSurface:

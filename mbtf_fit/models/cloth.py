@@ -1,0 +1,43 @@
+"""Cloth: a neural material that traces the envelope of fibers and knows their directions.
+
+:mod:`Relief <mbtf_fit.models.relief>` on the heights that fibers show from above, whose decoder also sees
+light and view about the fibers' axis (:mod:`mbtf_fit.ops.fibers`): fibers scatter light along cones about
+their axis (Marschner et al., SIGGRAPH 2003), which neither the normal nor the half vector of a surface tells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+from mbtf_fit.models.relief import Relief
+from mbtf_fit.ops import FiberFrame, Operation
+from mbtf_fit.ops.constants import FIBERS, PLACES
+from mbtf_fit.sections import NetworkSection
+
+
+class Cloth(Relief):
+    """A model that knows heights and directions of fibers."""
+
+    name = "cloth"
+    description = "traces fibers' envelope, and knows their directions"
+    defaults: ClassVar[Mapping[str, Any]] = {
+        **Relief.defaults,
+        "training": {
+            **Relief.defaults["training"],
+            # The relative loss alone leaves the grazing highlights of fibers at half their value.
+            "losses": [
+                {"kind": "relative"},
+                {"kind": "chroma", "weight": 3.0},
+                {"kind": "squared", "weight": 0.1},
+            ],
+        },
+    }
+    reads_geometry: ClassVar[Sequence[str]] = ("height", "tangent_moment.xx")
+
+    @classmethod
+    def surface_inputs(cls, network: NetworkSection) -> tuple[list[Operation], list[str]]:
+        operations, names = super().surface_inputs(network)
+        _, finer = PLACES[network.relief.places]
+        fibers = FiberFrame("fibers", "hits", "level", "omega_i", "omega_o", FIBERS, finer)
+        return [*operations, fibers], [*names, "fibers"]
