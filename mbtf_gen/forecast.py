@@ -16,7 +16,6 @@ from mbtf_core.data.shard_files import write_shard
 from mbtf_core.forecast import pilot_seconds
 from mbtf_core.stats import pooled_error
 from mbtf_core.units import clock, expectation, rate_text, size_text
-from mbtf_gen.config.generator import parse_count
 from mbtf_gen.job import (
     Job,
     data_bytes,
@@ -41,12 +40,8 @@ _PIECE_PATHS, _FIRST_PATHS, _PIECE_SECONDS = 1 << 19, 1 << 13, 0.5
 LONG_RUN = 30_000_000
 # Likewise through fibers, which scatter light many times.
 LONG_FIBER_RUN = 1_000_000
-# Data of fewer paths per query take little less time.
-FEWEST_SPP = 4
 # Relative error of a predicted noise from which it is stated; a pilot without highlights has a tenth of it.
 _UNCERTAIN = 0.02
-# Time from which a shorter command is named.
-_LONG_SECONDS = 120.0
 
 
 @dataclass(frozen=True)
@@ -165,12 +160,7 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
 
 
 def announce(
-    console: Console,
-    paths: float,
-    seconds: Callable[[], float],
-    size: float,
-    fibers: bool = False,
-    faster: str = "",
+    console: Console, paths: float, seconds: Callable[[], float], size: float, fibers: bool = False
 ) -> None:
     """State the expected time and size of a command, unless no machine needs a minute for it.
 
@@ -180,12 +170,9 @@ def announce(
     seconds : measures its duration; called for many paths only
     size : bytes that it writes
     fibers : whether the paths lead through fibers
-    faster : options of a shorter command, which is named where it takes long
     """
     if paths >= (LONG_FIBER_RUN if fibers else LONG_RUN):
-        expected = seconds()
-        hint = f"; faster: {faster}" if faster and expected > _LONG_SECONDS else ""
-        console.note(f"{expectation(expected, size)}{hint}")
+        console.note(expectation(seconds(), size))
 
 
 def announce_shards(
@@ -198,11 +185,5 @@ def announce_shards(
         expected = forecast(job, plan, seconds=1.0)
         return expected.start + share * expected.seconds
 
-    paths, queries = 0 if plan.effects.closed_form else share * most_paths(job), job.config.queries
-    number, per_texel = parse_count(queries.train)
-    faster = f"--queries {max(1, round(number / 4))}{'/texel' * per_texel}"
-    if split_queries(job, "train") * queries.spp < split_queries(job, "test") * queries.test_spp:
-        faster = f"--test-queries {max(1, split_queries(job, 'test') // 4)}"
-    elif queries.target_error is None and queries.spp > FEWEST_SPP:
-        faster += f", --spp {queries.spp // 4 * 2}"
-    announce(console, paths, seconds, size, job.material.scatters, faster)
+    paths = 0 if plan.effects.closed_form else share * most_paths(job)
+    announce(console, paths, seconds, size, job.material.scatters)

@@ -155,8 +155,7 @@ def describe(summary: Summary, *, ran: bool = True) -> str:
     if ran and summary.paths:
         lines.append(
             f"  this run: {summary.paths} paths in {clock(summary.seconds)} with start-up "
-            f"({rate_text(summary.paths_per_second)}), "
-            f"{summary.waiting_seconds:.1f} s of it waiting for the disk"
+            f"({rate_text(summary.paths_per_second)})"
         )
     elif ran:
         lines.append("  this run: nothing left to do")

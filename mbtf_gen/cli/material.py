@@ -124,16 +124,14 @@ def plan(
 
     job = prepare_job(options, material, quality)
     job.announce_briefly()
-    small = skips_pilots(job)
-    found = plan_effects(job, pilots=not small)
-    note = found.omitted_by(plan_effects(job)) if small else ""
+    found = plan_effects(job, pilots=not skips_pilots(job))
     if not measure:
-        console.report({**found.to_manifest(), "forecast": None}, found.describe(note))
+        console.report({**found.to_manifest(), "forecast": None}, found.describe())
         return
     from mbtf_gen.forecast import forecast
     from mbtf_gen.planning.run_plan import allocate, measured
 
     expected = forecast(job, allocate(job, found))
     found = measured(job, found)
-    text = f"{found.describe(note)}\n{expected.describe(split_target(job.config, 'train'))}"
+    text = f"{found.describe()}\n{expected.describe(split_target(job.config, 'train'))}"
     console.report({**found.to_manifest(), "forecast": asdict(expected)}, text)

@@ -281,8 +281,7 @@ def render_missing(
             paths, estimator = len(missing) * view.size**2 * view.spp, picture_estimator(job)
             seconds = partial(picture_seconds, estimator, cameras[0], omega_i, paths)
             size, fibers = len(missing) * _picture_bytes(job, view), job.material.scatters
-            faster = f"--size {max(1, view.size // 2)}, --spp {max(2, view.spp // 4 * 2)}"
-            announce(console, paths, seconds, size, fibers, faster)
+            announce(console, paths, seconds, size, fibers)
         for done in runner.map(render_shape if surface else render_reference, items):
             if done.error:
                 hint = "the same command renders the missing pictures"
