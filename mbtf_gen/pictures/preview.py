@@ -107,10 +107,8 @@ def draw_preview(
 
     Parameters
     ----------
-    config : options of the pictures and of the material
     dataset : data set whose queries are shown; without one, those that a run would draw
     path : folder of the pictures
-    console : where notes and results go
     overwrite : replace the pictures of another configuration
 
     Raises

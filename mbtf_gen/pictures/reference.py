@@ -308,11 +308,7 @@ def render_references(
 
     Parameters
     ----------
-    config : the material, the views and the light
-    output : the folder
-    console : where progress and results go
-    cluster : str, optional
-        Workers, as :func:`mbtf_core.run.cluster.open_runner` takes them.
+    cluster : workers, as :func:`mbtf_core.run.cluster.open_runner` takes them
     overwrite : replace the pictures of another configuration
 
     Raises
