@@ -141,8 +141,6 @@ def generate(
 
 def describe(summary: Summary, *, ran: bool = True) -> str:
     """What a folder of shards holds and, where it `ran`, what the run added."""
-    from mbtf_core.stats import Estimate
-
     state = "complete" if summary.complete else "unfinished: run the other slices, then mbtf-gen merge"
     counts = " + ".join(f"{n} {'training' if k == 'train' else k}" for k, n in summary.splits.items())
     lines = [f"{summary.folder}: {counts} queries, {state}"]
@@ -159,9 +157,7 @@ def describe(summary: Summary, *, ran: bool = True) -> str:
         )
     elif ran:
         lines.append("  this run: nothing left to do")
-    value, error = summary.relative_error, summary.relative_error_se
-    shown = f"{100.0 * value:.1f}" if error is None else Estimate(100.0 * value, 100.0 * error, 1)
-    noise = f"pooled noise of a training query {shown}% of the mean"
+    noise = f"pooled noise of a training query {summary.relative_error:.1%} of the mean"
     if summary.complete and summary.relative_error > 0:
         # The variance of every value falls at least like one over the number of paths.
         more = clock(3.0 * summary.shard_seconds)

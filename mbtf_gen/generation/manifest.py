@@ -74,8 +74,6 @@ def new_manifest(
     ----------
     arrays : stored arrays, and their meanings where those of the schema do not apply
     splits : what is stated of each split besides its shards
-    entries : all shards
-    layout : of the queries
     others : further keys, or other values of some
     """
     config, lattice = source.config.model_dump(mode="json"), source.lattice
@@ -183,7 +181,6 @@ class Summary:
     shard_seconds : rendering time of all finished shards, over all runs
     relative_error : pooled relative standard error of the training values, √(mean variance) / mean value;
         None where their noise is unknown
-    relative_error_se : standard error of `relative_error`; None of fewer than four shards
     mean_value : mean training value per channel, 1/sr
     lost, capped, nonfinite : rays that slipped through the surface, rays cut at the cap on tile crossings,
         and non-finite samples that were sampled again, over all shards
@@ -202,7 +199,6 @@ class Summary:
     paths_per_second: float
     shard_seconds: float
     relative_error: float | None
-    relative_error_se: float | None
     mean_value: list[float]
     lost: int
     capped: int
@@ -214,10 +210,6 @@ class Summary:
 
 def finish(folder: str | Path | DataFolder, *, paths: int = 0, seconds: float = 0.0) -> Summary:
     """Complete the manifest if every shard is finished, and summarize (``mbtf-gen merge``).
-
-    Parameters
-    ----------
-    paths, seconds : of the run that ends, see :class:`Summary`
 
     Raises
     ------
@@ -265,7 +257,6 @@ def finish(folder: str | Path | DataFolder, *, paths: int = 0, seconds: float = 
         lost=totals.counts["lost_rays"],
         capped=totals.counts["capped_rays"],
         nonfinite=totals.counts["nonfinite_samples"],
-        relative_error_se=totals.relative_error_se(),
         effects=[EFFECTS[e.name].description for e in effects if e.on],
         measured=measured,
         **sums,

@@ -85,12 +85,8 @@ class EffectsPlan:
 
 
 def consistent(decided: dict[str, EffectDecision], request: EffectsRequest) -> dict[str, EffectDecision]:
-    """Decisions by name, where effects that need the displaced surface are off without it.
-
-    Raises
-    ------
-    UsageError : the request forces such an effect on
-    """
+    """Decisions by name, where effects that need the displaced surface are off without it; a UsageError if
+    the request forces such an effect on."""
     out = dict(decided)
     if out["parallax"].on:
         return out
@@ -104,12 +100,7 @@ def consistent(decided: dict[str, EffectDecision], request: EffectsRequest) -> d
 
 
 def without(plan: EffectsPlan, name: str) -> EffectsPlan:
-    """The plan without an effect and without those that need it.
-
-    Raises
-    ------
-    UsageError : the material requires the effect
-    """
+    """The plan without an effect and without those that need it; a UsageError if the material requires it."""
     request = EffectsRequest("auto", {name: False})
     decided = consistent({e.name: request.decide(e) for e in plan.effects}, request)
     return replace(plan, effects=tuple(decided.values()))

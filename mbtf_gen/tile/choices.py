@@ -54,8 +54,9 @@ def _shown(spec: MaterialFile, material: HeightFieldTile) -> Iterator[tuple[str,
         reason = "as the heights' slopes show" if decided else "by its name or assumed"
         yield "normal.convention", Choice(material.normal_convention, reason)
     if (color := spec.base_color) is not None and color.file is not None and color.colorspace is None:
+        space = material.facts["base_color"].colorspace
         # Another declared space is converted only where none is given.
-        if (space := material.facts["base_color"].colorspace) in get_args(ColorSpace):
+        if space in get_args(ColorSpace):
             yield "base_color.colorspace", Choice(space, "as its file is read")
 
 
