@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from mbtf_core.app.console import Console
 from mbtf_core.color import brightness, chosen_exposure, describe_exposure
-from mbtf_core.data.dataset import Dataset
 from mbtf_core.directions import from_angles
-from mbtf_core.errors import InputError, PartialError
+from mbtf_core.errors import PartialError
 from mbtf_core.extras import extra_error, has_extra
 from mbtf_core.files.folders import check_space, owned
 from mbtf_core.pictures import PNG_BYTES, Camera, claim_pictures, tiles_camera, write_display
@@ -24,7 +23,7 @@ from mbtf_gen.config.pictures import PreviewConfig
 from mbtf_gen.forecast import announce
 from mbtf_gen.job import Job
 from mbtf_gen.pictures import mesh
-from mbtf_gen.pictures.query_plots import sampled_queries, stored_queries, write_plots
+from mbtf_gen.pictures.query_plots import write_plots
 from mbtf_gen.pictures.reference import (
     note_fine_pixels,
     picture_estimator,
@@ -44,18 +43,19 @@ class _Scene:
     job: Job
     camera: Camera
     omega_i: NDArray[np.float64]
-    console: Console
     size: int
     spp: int
 
-    def beauty(self, file: Path, advance: Callable[[float, str], None]) -> tuple[str, float]:
+    def beauty(
+        self, file: Path, console: Console, advance: Callable[[float, str], None]
+    ) -> tuple[str, float]:
         """Write the path-traced picture; returns what it shows, and its exposure. `advance` is called with
         the share of its paths that are traced, and their rate."""
         advance(0.0, "building the scene, compiling kernels")
         estimator = picture_estimator(self.job)
         paths = self.camera.rows * self.camera.columns * self.spp
         announce(
-            self.console,
+            console,
             paths,
             lambda: picture_seconds(estimator, self.camera, self.omega_i, paths),
             PNG_BYTES * self.size**2,
@@ -95,67 +95,43 @@ class _Scene:
         return shows, mesh.draw(drawn, self.camera, self.omega_i, file)
 
 
-def draw_preview(
-    config: PreviewConfig,
-    dataset: Dataset | None,
-    path: Path,
-    console: Console,
-    *,
-    overwrite: bool = False,
-) -> None:
-    """Draw the pictures of a material or a data set, and report them.
-
-    Parameters
-    ----------
-    dataset : data set whose queries are shown; without one, those that a run would draw
-    path : folder of the pictures
-    overwrite : replace the pictures of another configuration
+def draw_preview(config: PreviewConfig, path: Path, console: Console, *, overwrite: bool = False) -> None:
+    """Draw the pictures of a material in a folder, and report them.
 
     Raises
     ------
-    InputError
-        The material cannot be read, and there is no data set either; or the folder holds something else.
+    InputError : the material cannot be read, or the folder holds something else
     UsageError : the view shows the horizon
     PartialError : the mesh could not be drawn; everything else was
     """
-    scene = _scene(config, dataset, console)
-    names, inputs = ["queries"], {} if dataset is None else {"data set": dataset.manifest["config_hash"]}
-    if scene is not None:
-        config, material = scene.config, scene.job.material
-        names = ["mesh", "beauty", *names] if material.grid is not None else ["beauty", *names]
-        note_fine_pixels([scene.camera], scene.job.lattice, console)
-        inputs |= material.digests
-    size = len(names) * PNG_BYTES * config.preview.sizes(fibers=False)[0] ** 2
+    scene = _scene(config)
+    material, exposure, fault = scene.job.material, 0.0, ""
+    names = ["beauty", "queries"] if material.grid is None else ["mesh", "beauty", "queries"]
+    files, shown = {name: path / f"{name}.png" for name in names}, dict[str, str]()
+    note_fine_pixels([scene.camera], scene.job.lattice, console)
+    size = len(names) * PNG_BYTES * scene.size**2
     check_space(path, size, "reduce --size, or choose another folder with -o")
-    files = {name: path / f"{name}.png" for name in names}
-    shown: dict[str, str] = {}
-    exposure: float | None = None
-    fault = ""
     with owned(path), console.progress(len(names), "drawing", "pictures") as bar:
         claim_pictures(
             path,
             "mbtf-gen preview",
             files=[file.name for file in files.values()],
-            config=config.model_dump(mode="json"),
-            inputs=inputs,
+            config=scene.config.model_dump(mode="json"),
+            inputs=material.digests,
             overwrite=overwrite,
         )
-        if scene is not None:
-            shown["beauty"], exposure = scene.beauty(
-                files["beauty"], lambda share, note: bar.update(round(share, 2), note)
-            )
-            if "mesh" in files:
-                # It has the exposure of the path-traced picture.
-                shown["mesh"], fault = scene.mesh(files["mesh"], exposure)
-        shown["queries"] = _queries(files["queries"], scene, dataset)
+        shown["beauty"], exposure = scene.beauty(
+            files["beauty"], console, lambda share, note: bar.update(round(share, 2), note)
+        )
+        if "mesh" in files:
+            # It has the exposure of the path-traced picture.
+            shown["mesh"], fault = scene.mesh(files["mesh"], exposure)
+        shown["queries"] = write_plots(files["queries"], scene.job)
         bar.update(len(names), "")
     drawn = [name for name in names if not (name == "mesh" and fault)]
-    lines = [f"{files[name]}: {shown[name]}" for name in drawn]
-    if exposure is not None:
-        lines.append(describe_exposure(exposure))
+    text = "\n".join([*(f"{files[name]}: {shown[name]}" for name in drawn), describe_exposure(exposure)])
     pictures = [{"file": files[name], "shows": shown[name]} for name in drawn]
-    found = {"folder": path, "pictures": pictures, "exposure": exposure, "fault": fault or None}
-    console.report(found, "\n".join(lines))
+    console.report({"folder": path, "pictures": pictures, "exposure": exposure, "fault": fault or None}, text)
     if fault and not has_extra("pyvista"):
         missing = extra_error("pyvista", files["mesh"])
         console.note(f"note: {missing.where} is not drawn: {missing.what}; {missing.hint}")
@@ -167,20 +143,9 @@ def draw_preview(
         )
 
 
-def _scene(config: PreviewConfig, dataset: Dataset | None, console: Console) -> _Scene | None:
-    """The scene of the 3D pictures; None with a data set whose material cannot be read."""
-    options = config.preview
-    try:
-        job = Job.load(config)
-        if dataset is None:
-            job.announce_briefly()
-        elif job.material.digests != dataset.manifest["inputs"]:
-            raise InputError("has changed since the data set was made", where=config.material)
-    except InputError as error:
-        if dataset is None:
-            raise
-        console.note(f"only the queries are drawn: {error.where}: {error.what}")
-        return None
+def _scene(config: PreviewConfig) -> _Scene:
+    options, job = config.preview, Job.load(config)
+    job.announce_briefly()
     size, spp = options.sizes(job.material.scatters)
     camera = tiles_camera(
         options.view.elevation,
@@ -194,16 +159,4 @@ def _scene(config: PreviewConfig, dataset: Dataset | None, console: Console) -> 
     camera.queries(omega_i, job.material.aspect)  # refuses a view of the horizon
     options = options.model_copy(update={"size": size, "spp": spp})
     config = config.model_copy(update={**dict(job.config), "preview": options})
-    return _Scene(config, job, camera, omega_i, console, size, spp)
-
-
-def _queries(file: Path, scene: _Scene | None, dataset: Dataset | None) -> str:
-    """Write the plots of the queries; returns what they show."""
-    if dataset is not None:
-        sample, source = stored_queries(dataset), f"stored in {dataset.folder}"
-    else:
-        assert scene is not None
-        sample, source = sampled_queries(scene.job), f"sampled for {scene.config.material}"
-    shown = f"{sample.queries.sigma.size} of {sample.total} training queries {source}"
-    write_plots(file, sample, shown)
-    return f"positions, levels and directions of {shown}"
+    return _Scene(config, job, camera, omega_i, size, spp)
