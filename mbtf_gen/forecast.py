@@ -4,24 +4,19 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from mbtf_core.app.console import Console
-from mbtf_core.data.schema import ShardEntry
 from mbtf_core.data.shard_files import write_shard
 from mbtf_core.forecast import pilot_seconds
 from mbtf_core.stats import pooled_error
-from mbtf_core.units import clock, expectation, rate_text, size_text
+from mbtf_core.units import clock, rate_text, size_text
 from mbtf_gen.job import (
     Job,
     data_bytes,
-    most_paths,
     path_work,
-    planned_work,
     split_lights,
     split_queries,
     split_spp,
@@ -36,10 +31,6 @@ _HALVES = ("value_a", "value_b")
 # Paths of one piece of the pilot at most, and of the first pieces, which compile the kernels and measure the
 # speed; the time that a piece may take.
 _PIECE_PATHS, _FIRST_PATHS, _PIECE_SECONDS = 1 << 19, 1 << 13, 0.5
-# Fewer paths take less than a minute at half a million paths per second.
-LONG_RUN = 30_000_000
-# Likewise through fibers, which scatter light many times.
-LONG_FIBER_RUN = 1_000_000
 # Relative error of a predicted noise from which it is stated; a pilot without highlights has a tenth of it.
 _UNCERTAIN = 0.02
 
@@ -157,33 +148,3 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
         relative_error=error.value,
         relative_error_se=error.error,
     )
-
-
-def announce(
-    console: Console, paths: float, seconds: Callable[[], float], size: float, fibers: bool = False
-) -> None:
-    """State the expected time and size of a command, unless no machine needs a minute for it.
-
-    Parameters
-    ----------
-    paths : that it traces
-    seconds : measures its duration; called for many paths only
-    size : bytes that it writes
-    fibers : whether the paths lead through fibers
-    """
-    if paths >= (LONG_FIBER_RUN if fibers else LONG_RUN):
-        console.note(expectation(seconds(), size))
-
-
-def announce_shards(
-    console: Console, job: Job, plan: RunPlan, entries: Sequence[ShardEntry], size: float
-) -> None:
-    """:func:`announce` for rendering some of the job's shards."""
-    share = planned_work(job, entries) / max(planned_work(job, job.shards), 1)
-
-    def seconds() -> float:
-        expected = forecast(job, plan, seconds=1.0)
-        return expected.start + share * expected.seconds
-
-    paths = 0 if plan.effects.closed_form else share * most_paths(job)
-    announce(console, paths, seconds, size, job.material.scatters)

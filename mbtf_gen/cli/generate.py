@@ -102,7 +102,6 @@ def generate(
     from mbtf_core.data.folder import DataFolder
     from mbtf_core.files.folders import check_space
     from mbtf_core.run.cluster import open_runner
-    from mbtf_gen.forecast import announce_shards
     from mbtf_gen.generation.run import generate, unfinished
     from mbtf_gen.job import data_bytes, split_queries
 
@@ -130,7 +129,6 @@ def generate(
             overwrite=overwrite,
             slice_index=index,
             slice_count=count,
-            planned=lambda plan: announce_shards(console, job, plan, left, size),
             progress=bar.update,
             runner=runner,
         )

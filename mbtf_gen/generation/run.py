@@ -63,7 +63,6 @@ def generate(
     overwrite: bool = False,
     slice_index: int = 1,
     slice_count: int = 1,
-    planned: Callable[[RunPlan], None] | None = None,
     progress: ProgressCallback | None = None,
     runner: Runner | None = None,
 ) -> Summary:
@@ -84,8 +83,6 @@ def generate(
         because another slice may have begun it.
     slice_index, slice_count : int
         Generate every `slice_count`-th shard only, starting with number `slice_index`, from 1.
-    planned : callable, optional
-        Called with the run's plan. A new data set is not yet written then.
     progress : callable, optional
         Called at the begin of each phase, and after every launch of this process and every shard, with the
         paths of this run so far, a note, and the paths that the run is expected to trace (None where a
@@ -118,23 +115,14 @@ def generate(
     if job is not source:
         job.announce()
     overwrite = overwrite and not (slice_count > 1 and has_dataset(folder, job.config_hash))
-    plans: list[RunPlan] = []
 
-    def new_plan(job: Job) -> RunPlan:
-        def note(phase: str) -> None:
-            if progress is not None:
-                progress(0.0, phase, None)
+    def note(phase: str) -> None:
+        if progress is not None:
+            progress(0.0, phase, None)
 
-        plans.append(plan_run(job, note))
-        if planned is not None:
-            note("forecasting the time")
-            planned(plans[0])
-        return plans[0]
-
-    run = ShardRun(job, folder, open_folder(job, folder, new_plan, overwrite))
+    plan = open_folder(job, folder, lambda job: plan_run(job, note), overwrite)
     entries = unfinished(job, folder, slice_index, slice_count)
-    if planned is not None and not plans and entries:
-        planned(run.plan)
+    run = ShardRun(job, folder, plan)
     paths = render_shards(run, entries, runner or Runner(), progress=progress)
     summary = finish(folder, paths=paths, seconds=time.perf_counter() - start)
     if slice_count == 1 and not summary.complete:

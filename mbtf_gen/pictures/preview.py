@@ -20,14 +20,12 @@ from mbtf_core.pictures import PNG_BYTES, Camera, claim_pictures, tiles_camera, 
 from mbtf_core.stats import pooled_relative_error
 from mbtf_core.units import rate_text
 from mbtf_gen.config.pictures import PreviewConfig
-from mbtf_gen.forecast import announce
 from mbtf_gen.job import Job
 from mbtf_gen.pictures import mesh
 from mbtf_gen.pictures.query_plots import write_plots
 from mbtf_gen.pictures.reference import (
     note_fine_pixels,
     picture_estimator,
-    picture_seconds,
     render_reference,
 )
 
@@ -46,21 +44,12 @@ class _Scene:
     size: int
     spp: int
 
-    def beauty(
-        self, file: Path, console: Console, advance: Callable[[float, str], None]
-    ) -> tuple[str, float]:
+    def beauty(self, file: Path, advance: Callable[[float, str], None]) -> tuple[str, float]:
         """Write the path-traced picture; returns what it shows, and its exposure. `advance` is called with
         the share of its paths that are traced, and their rate."""
         advance(0.0, "building the scene, compiling kernels")
         estimator = picture_estimator(self.job)
         paths = self.camera.rows * self.camera.columns * self.spp
-        announce(
-            console,
-            paths,
-            lambda: picture_seconds(estimator, self.camera, self.omega_i, paths),
-            PNG_BYTES * self.size**2,
-            self.job.material.scatters,
-        )
         traced, began = 0, time.perf_counter()
 
         def observe(count: int) -> None:
@@ -121,7 +110,7 @@ def draw_preview(config: PreviewConfig, path: Path, console: Console, *, overwri
             overwrite=overwrite,
         )
         shown["beauty"], exposure = scene.beauty(
-            files["beauty"], console, lambda share, note: bar.update(round(share, 2), note)
+            files["beauty"], lambda share, note: bar.update(round(share, 2), note)
         )
         if "mesh" in files:
             # It has the exposure of the path-traced picture.
