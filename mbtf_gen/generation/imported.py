@@ -284,18 +284,8 @@ def import_measured(
     overwrite: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> Summary:
-    """Write a measured BTF as a data set, or finish an unfinished one.
-
-    Parameters
-    ----------
-    folder : output folder, or a URL
-    progress : called with the number of queries that are written
-
-    Raises
-    ------
-    InputError : the file is damaged, or the folder contains something else
-    PartialError : the folder cannot be written, or another process writes to it; the same command resumes
-    """
+    """Write a measured BTF as a data set, or finish an unfinished one; errors as of
+    :func:`~mbtf_gen.generation.run.generate`. `progress` is called with the number of queries written."""
     start = time.perf_counter()
     folder = DataFolder.open(folder)
     with owned(folder.workspace):

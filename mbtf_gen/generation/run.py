@@ -261,19 +261,8 @@ def render_shards(
     *,
     progress: ProgressCallback | None = None,
 ) -> int:
-    """Render those of the shards that are not finished; returns the number of paths traced.
-
-    Parameters
-    ----------
-    runner : maps :func:`render_shard` over the shards
-    progress : as of :func:`generate`
-
-    Raises
-    ------
-    InputError : a worker cannot read the material or the folder
-    PartialError : other processes render some of them, shards failed, the disk is full, the store or the
-        workers cannot be reached, or there are too many non-finite samples; finished shards are kept
-    """
+    """Render those of the shards that are not finished; returns the number of paths traced. Errors are those
+    of :func:`generate`; finished shards are kept."""
     start, job, folder = time.perf_counter(), run.job, run.folder
     totals, limit = ShardStatistics(), most_paths(job)
     # Leftovers of killed runs take disk space.

@@ -37,21 +37,11 @@ def store_shard(
     estimates: Estimates | None = None,
     seconds: float = 0.0,
 ) -> dict[str, Any]:
-    """Write a shard, then its sidecar.
+    """Write a shard, then its sidecar, which is returned; errors as of
+    :meth:`~mbtf_core.data.folder.DataFolder.write_shard`.
 
-    Parameters
-    ----------
-    arrays : of the shard; without ``value_b``, values are measured and their noise is unknown
-    config_hash, plan : digests of the configuration and of the run plan
-    seed : root seed
-    spp : planned paths of a query; None of measured values
-    estimates : where the values come from; None of measured values
-    seconds : duration of the rendering
-
-    Returns
-    -------
-    dict
-        The sidecar. Errors are those of :meth:`~mbtf_core.data.folder.DataFolder.write_shard`.
+    `config_hash` and `plan` are digests. Measured values have no ``value_b``, for their noise is unknown, no
+    `spp` (the planned paths of a query), and no `estimates`.
     """
     halves = [arrays[name].reshape(-1, 3) for name in ("value_a", "value_b") if name in arrays]
     mean = sum(half.mean(axis=0, dtype=np.float64) for half in halves) / len(halves)

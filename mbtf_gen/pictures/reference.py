@@ -233,7 +233,7 @@ def render_missing(
     surface: Chart | DisplacedMesh | None = None,
 ) -> list[str]:
     """Render the pictures of :func:`picture_names` that a folder lacks, as EXR images, and record their
-    noise and brightness; returns their names.
+    noise and brightness; returns their names. `advance` is called with pictures done, and parts of them.
 
     Raises
     ------
@@ -282,20 +282,8 @@ def render_references(
     cluster: str | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Render the missing pictures of a folder, show all at one exposure, and report them.
-
-    Parameters
-    ----------
-    cluster : workers, as :func:`mbtf_core.run.cluster.open_runner` takes them
-    overwrite : replace the pictures of another configuration
-
-    Raises
-    ------
-    UsageError : the view shows the horizon, or the camera is inside the surface
-    InputError : the folder holds something else, the surface cannot be displaced, or the pictures do not fit
-        on the disk
-    PartialError : a picture failed; the same command renders the missing ones
-    """
+    """Render the missing pictures of a folder, show all at one exposure, and report them; errors as of
+    :func:`check_view` and :func:`render_missing`, and for a folder that holds something else."""
     wanted, job = config.reference, Job.load(config)
     inputs, surface = dict(job.material.digests), _surface(wanted, job.material.aspect)
     if surface is not None:
