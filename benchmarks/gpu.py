@@ -198,7 +198,7 @@ class Comparison:
 
     def selftest(self) -> None:
         """The generator's own checks."""
-        found = self.measure("selftest", "selftest", self.sizes.text())
+        found = self.measure("selftest", "selftest")
         self.checks += [
             Check(f"selftest: {name}", 0.0 if state == "ok" else None, note="" if state == "ok" else state)
             for name, state in (found or {}).items()

@@ -44,7 +44,6 @@ class Sizes:
     steps, batch : training of the models
     image_steps, image_batch : training of models that need the image layout
     rows, columns : pixels of the picture that is evaluated
-    selftest : seconds of the self-test
     """
 
     material: str
@@ -59,7 +58,6 @@ class Sizes:
     image_batch: int = 1 << 12
     rows: int = 1080
     columns: int = 1920
-    selftest: float = 60.0
 
     def text(self) -> str:
         """As an argument of a child process."""
@@ -95,17 +93,15 @@ def save_finite(path: str | Path, **arrays: Any) -> None:
     np.savez(path, **arrays)
 
 
-def selftest(sizes: str) -> Answers:
+def selftest() -> Answers:
     """State of every check of ``mbtf-gen selftest``, or why it could not run."""
-    from mbtf_gen.checks import run_checks
+    from mbtf_gen.checks import run_check
     from mbtf_gen.engine.runtime import load_mitsuba
     from mbtf_gen.selftest import all_checks
 
     load_mitsuba()
-    checks = all_checks()
-    run_checks(checks, Sizes.read(sizes).selftest)
-    for check in checks:
-        yield {check.name: check.finding.found if check.failed else check.finding.state}
+    for found in map(run_check, all_checks()):
+        yield {found.name: found.found if found.state == "failed" else found.state}
 
 
 def generate_data(sizes: str, layout: Layout, folder: str) -> Answers:

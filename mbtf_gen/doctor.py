@@ -12,6 +12,7 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -20,7 +21,7 @@ from typing import Any
 from mbtf_core.errors import EngineError
 from mbtf_core.extras import extra_error, has_extra, import_extra
 from mbtf_core.run.processes import run_child
-from mbtf_gen.checks import Check, Finding
+from mbtf_gen.checks import Absent, Check
 from mbtf_gen.engine.runtime import (
     CACHE_VARIABLE,
     CPU_VARIANT,
@@ -47,31 +48,27 @@ def all_checks() -> list[Check]:
         Check("Python", _python),
         Check("Mitsuba", _mitsuba, hint=f"{_REINSTALL} mitsuba==3.9.1 karellen-llvm-core"),
         Check("CUDA", _cuda, required=False),
-        Check("PyTorch", _in_child(use_torch), hint=f"{_REINSTALL} 'torch>=2.13,<2.15'"),
+        Check("PyTorch", partial(_in_child, use_torch), hint=f"{_REINSTALL} 'torch>=2.13,<2.15'"),
         Check("Drawing", _drawing, required=False, hint=_OPENGL),
-        Check("Kernel cache", _in_child(use_kernel_cache), required=False, hint=_CACHE),
+        Check("Kernel cache", partial(_in_child, use_kernel_cache), required=False, hint=_CACHE),
     ]
 
 
-def _in_child(use: Callable[[], Iterator[dict[str, str]]]) -> Callable[[int], Finding]:
-    """A check that calls a function of this module in a child process; it yields ``found``, in words."""
-
-    def run(_: int) -> Finding:
-        outcome = run_child(__name__, use.__name__, timeout=_TIMEOUT)
-        if outcome.fault:
-            raise EngineError(outcome.fault)
-        return Finding("ok", outcome.answers["found"])
-
-    return run
+def _in_child(use: Callable[[], Iterator[dict[str, str]]]) -> str:
+    """Call a function of this module in a child process; it yields ``found``, in words."""
+    outcome = run_child(__name__, use.__name__, timeout=_TIMEOUT)
+    if outcome.fault:
+        raise EngineError(outcome.fault)
+    return str(outcome.answers["found"])
 
 
-def _python(_: int) -> Finding:
+def _python() -> str:
     free = shutil.disk_usage(Path.cwd()).free
     found = f"{platform.python_version()} on {platform.platform(terse=True)}, {sys.executable}; "
-    return Finding("ok", f"{found}{free / 1e9:.1f} GB free in {Path.cwd()}")
+    return f"{found}{free / 1e9:.1f} GB free in {Path.cwd()}"
 
 
-def _mitsuba(_: int) -> Finding:
+def _mitsuba() -> str:
     library = chosen_llvm()
     # Tested again: a cached result does not show the state of today.
     outcome = prove(CPU_VARIANT)
@@ -83,21 +80,21 @@ def _mitsuba(_: int) -> Finding:
     if library is None or library == str(shipped_llvm()):
         origin = "of the system" if library is None else "of the installation"
     programs = f"{version('mitsuba')} with Dr.Jit {version('drjit')} and LLVM {numbers} {origin}"
-    return Finding("ok", f"{programs} ({library or 'found by Dr.Jit'}) ran test kernels")
+    return f"{programs} ({library or 'found by Dr.Jit'}) ran test kernels"
 
 
-def _cuda(_: int) -> Finding:
+def _cuda() -> str:
     outcome = prove(CUDA_VARIANT)
     if outcome.fault:
-        return Finding("absent", f"{outcome.fault}; the CPU is used")
-    return Finding("ok", "ran test kernels")
+        raise Absent(f"{outcome.fault}; the CPU is used")
+    return "ran test kernels"
 
 
-def _drawing(number: int) -> Finding:
+def _drawing() -> str:
     if not has_extra("pyvista"):
         missing = extra_error("pyvista", "3D pictures")
-        return Finding("absent", f"{missing.what}; for 3D pictures: {missing.hint}")
-    return _in_child(use_drawing)(number)
+        raise Absent(f"{missing.what}; for 3D pictures: {missing.hint}")
+    return _in_child(use_drawing)
 
 
 # The functions below run in child processes.

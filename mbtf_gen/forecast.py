@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from mbtf_core.app.console import Console
-from mbtf_core.data.schema import ShardEntry
 from mbtf_core.data.shard_files import write_shard
 from mbtf_core.forecast import pilot_seconds
 from mbtf_core.stats import pooled_error
-from mbtf_core.units import clock, expectation, rate_text, size_text
-from mbtf_gen.config.generator import parse_count
+from mbtf_core.units import clock, rate_text, size_text
 from mbtf_gen.job import (
     Job,
     data_bytes,
-    most_paths,
     path_work,
-    planned_work,
     split_lights,
     split_queries,
     split_spp,
@@ -37,16 +31,8 @@ _HALVES = ("value_a", "value_b")
 # Paths of one piece of the pilot at most, and of the first pieces, which compile the kernels and measure the
 # speed; the time that a piece may take.
 _PIECE_PATHS, _FIRST_PATHS, _PIECE_SECONDS = 1 << 19, 1 << 13, 0.5
-# Fewer paths take less than a minute at half a million paths per second.
-LONG_RUN = 30_000_000
-# Likewise through fibers, which scatter light many times.
-LONG_FIBER_RUN = 1_000_000
-# Data of fewer paths per query take little less time.
-FEWEST_SPP = 4
 # Relative error of a predicted noise from which it is stated; a pilot without highlights has a tenth of it.
 _UNCERTAIN = 0.02
-# Time from which a shorter command is named.
-_LONG_SECONDS = 120.0
 
 
 @dataclass(frozen=True)
@@ -162,47 +148,3 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
         relative_error=error.value,
         relative_error_se=error.error,
     )
-
-
-def announce(
-    console: Console,
-    paths: float,
-    seconds: Callable[[], float],
-    size: float,
-    fibers: bool = False,
-    faster: str = "",
-) -> None:
-    """State the expected time and size of a command, unless no machine needs a minute for it.
-
-    Parameters
-    ----------
-    paths : that it traces
-    seconds : measures its duration; called for many paths only
-    size : bytes that it writes
-    fibers : whether the paths lead through fibers
-    faster : options of a shorter command, which is named where it takes long
-    """
-    if paths >= (LONG_FIBER_RUN if fibers else LONG_RUN):
-        expected = seconds()
-        hint = f"; faster: {faster}" if faster and expected > _LONG_SECONDS else ""
-        console.note(f"{expectation(expected, size)}{hint}")
-
-
-def announce_shards(
-    console: Console, job: Job, plan: RunPlan, entries: Sequence[ShardEntry], size: float
-) -> None:
-    """:func:`announce` for rendering some of the job's shards."""
-    share = planned_work(job, entries) / max(planned_work(job, job.shards), 1)
-
-    def seconds() -> float:
-        expected = forecast(job, plan, seconds=1.0)
-        return expected.start + share * expected.seconds
-
-    paths, queries = 0 if plan.effects.closed_form else share * most_paths(job), job.config.queries
-    number, per_texel = parse_count(queries.train)
-    faster = f"--queries {max(1, round(number / 4))}{'/texel' * per_texel}"
-    if split_queries(job, "train") * queries.spp < split_queries(job, "test") * queries.test_spp:
-        faster = f"--test-queries {max(1, split_queries(job, 'test') // 4)}"
-    elif queries.target_error is None and queries.spp > FEWEST_SPP:
-        faster += f", --spp {queries.spp // 4 * 2}"
-    announce(console, paths, seconds, size, job.material.scatters, faster)

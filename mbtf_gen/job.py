@@ -36,41 +36,17 @@ MAX_SHARD_FILES = 1_000_000
 
 @dataclass(frozen=True)
 class Job:
-    """A configuration with its material loaded: everything that determines the data.
-
-    Parameters
-    ----------
-    config : GeneratorConfig
-        All options.
-    material : Tile
-        What ``config.material`` names, loaded, under the options of the geometry.
-    """
+    """A configuration with its material loaded, under the options of the geometry: everything that determines
+    the data."""
 
     config: GeneratorConfig
     material: Tile
 
     @classmethod
     def load(cls, config: GeneratorConfig) -> Job:
-        """Load the material of a configuration. Its height scale, tiling and resolution replace unset ones.
-
-        Parameters
-        ----------
-        config : GeneratorConfig
-            All options.
-
-        Returns
-        -------
-        Job
-
-        Raises
-        ------
-        InputError
-            The material cannot be used.
-        """
-        return cls.of(
-            config,
-            latest_material(config.material, config.geometry.make_tileable, config.geometry.max_pixels),
-        )
+        """Load the material of a configuration, see :meth:`of`; an InputError if it cannot be used."""
+        geometry = config.geometry
+        return cls.of(config, latest_material(config.material, geometry.make_tileable, geometry.max_pixels))
 
     @classmethod
     def of(cls, config: GeneratorConfig, material: Tile) -> Job:

@@ -102,7 +102,7 @@ class LineProgress(Progress):
 
     def _print(self) -> None:
         self._shown = self._state
-        parts = [f"{self.label}: {self.done:.10g}"]
+        parts = [f"{self.label}: {round(self.done, 2):.10g}"]
         if self.unit == "%":
             parts[0] = f"{self.label}: {self.done:.0f}%"
         elif self.total:

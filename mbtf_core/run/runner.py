@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import inspect
-import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -62,11 +61,11 @@ class Runner:
                 locked: list[tuple[Item, Result]] = []
                 for item, value in overlap.run(waiting):
                     if not isinstance(value, MbtfError):
-                        result = Result(item.name, value, waited=overlap.waited)
+                        result = Result(item.name, value)
                     elif (found := failure(value))["fatal"] and not independent:
                         raise value
                     else:
-                        result = Result(item.name, **found, waited=overlap.waited)
+                        result = Result(item.name, **found)
                     if result.locked:
                         locked.append((item, result))
                         continue
@@ -89,8 +88,6 @@ class _Overlap:
         self._before = ThreadPoolExecutor(1, "ahead")
         self._after = ThreadPoolExecutor(1, "behind")
         self._open: list[Generator[None, None, Any]] = []
-        # Seconds that this thread has waited for the others.
-        self.waited = 0.0
 
     def close(self) -> None:
         """Wait for the threads, which finish what they do, and close the other items."""
@@ -116,9 +113,7 @@ class _Overlap:
             # One is behind at most: more would take memory.
             while ending and (not begun or len(ending) > 1 or ending[0][2].done()):
                 item, parts, last = ending.popleft()
-                began = time.perf_counter()
                 _, value = last.result()
-                self.waited += time.perf_counter() - began
                 self._open.remove(parts)
                 yield item, value
             if not begun:

@@ -62,7 +62,6 @@ class Result:
     fatal : the others fail for the same reason, such as files that a worker cannot read
     locked : another process works on the same files
     worker : machine and process; empty for this process
-    waited : seconds so far that this process has waited for last parts of generators
     """
 
     name: str
@@ -72,7 +71,6 @@ class Result:
     fatal: bool = False
     locked: bool = False
     worker: str = ""
-    waited: float = 0.0
 
     @property
     def message(self) -> str:

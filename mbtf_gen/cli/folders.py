@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,6 @@ from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import MovedMaterial
 from mbtf_core.errors import EXIT_BAD_INPUT, EXIT_OK, EXIT_PARTIAL
 from mbtf_core.run.signals import keep_on_interruption
-from mbtf_core.units import clock
 from mbtf_gen.cli.generate import describe
 
 if TYPE_CHECKING:
@@ -47,14 +45,11 @@ def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
     from mbtf_core.data.schema import GEOMETRY_NAME
     from mbtf_core.data.verify import foreign_files, verify
 
-    start = time.perf_counter()
     data_folder = DataFolder.open(folder)
     faults = verify(data_folder)
-    seconds = time.perf_counter() - start
     dataset = Dataset.open(data_folder)
     entries = [entry for split in dataset.splits for entry in dataset.entries(split)]
     files, foreign = [entry.file for entry in entries], foreign_files(data_folder, entries)
-    read = sum(data_folder.size(file) or 0 for file in files)
     absent = [f for f in faults if f.what in ABSENT and f.file in files]
     lines = [f"{data_folder.at(f.file)}: {f.what}; {f.hint}" for f in faults if f not in absent]
     if absent:
@@ -63,15 +58,13 @@ def verify(folder: Path, /, *, console: Console = CONSOLE) -> int:
     data: dict[str, Any] = {
         "folder": str(data_folder),
         "shards": len(files),
-        "bytes": read,
-        "seconds": round(seconds, 3),
+        "bytes": sum(data_folder.size(file) or 0 for file in files),
         "faults": [asdict(f) for f in faults],
         "foreign": foreign,
     }
     known = "" if dataset.manifest["geometry"] is None else f" and {GEOMETRY_NAME}"
     lines = lines or [f"{data_folder}: {len(files)} shards{known}, all intact"]
     console.report(data, "\n".join([*lines, *_describe_foreign(data_folder, foreign)]))
-    console.note(f"{read / 1e6:.1f} MB read in {clock(seconds)} ({read / 1e6 / max(seconds, 1e-9):.0f} MB/s)")
     return EXIT_BAD_INPUT if faults else EXIT_OK
 
 

@@ -102,7 +102,6 @@ def generate(
     from mbtf_core.data.folder import DataFolder
     from mbtf_core.files.folders import check_space
     from mbtf_core.run.cluster import open_runner
-    from mbtf_gen.forecast import announce_shards
     from mbtf_gen.generation.run import generate, unfinished
     from mbtf_gen.job import data_bytes, split_queries
 
@@ -130,7 +129,6 @@ def generate(
             overwrite=overwrite,
             slice_index=index,
             slice_count=count,
-            planned=lambda plan: announce_shards(console, job, plan, left, size),
             progress=bar.update,
             runner=runner,
         )
@@ -141,8 +139,6 @@ def generate(
 
 def describe(summary: Summary, *, ran: bool = True) -> str:
     """What a folder of shards holds and, where it `ran`, what the run added."""
-    from mbtf_core.stats import Estimate
-
     state = "complete" if summary.complete else "unfinished: run the other slices, then mbtf-gen merge"
     counts = " + ".join(f"{n} {'training' if k == 'train' else k}" for k, n in summary.splits.items())
     lines = [f"{summary.folder}: {counts} queries, {state}"]
@@ -155,14 +151,11 @@ def describe(summary: Summary, *, ran: bool = True) -> str:
     if ran and summary.paths:
         lines.append(
             f"  this run: {summary.paths} paths in {clock(summary.seconds)} with start-up "
-            f"({rate_text(summary.paths_per_second)}), "
-            f"{summary.waiting_seconds:.1f} s of it waiting for the disk"
+            f"({rate_text(summary.paths_per_second)})"
         )
     elif ran:
         lines.append("  this run: nothing left to do")
-    value, error = summary.relative_error, summary.relative_error_se
-    shown = f"{100.0 * value:.1f}" if error is None else Estimate(100.0 * value, 100.0 * error, 1)
-    noise = f"pooled noise of a training query {shown}% of the mean"
+    noise = f"pooled noise of a training query {summary.relative_error:.1%} of the mean"
     if summary.complete and summary.relative_error > 0:
         # The variance of every value falls at least like one over the number of paths.
         more = clock(3.0 * summary.shard_seconds)

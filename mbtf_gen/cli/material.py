@@ -11,7 +11,6 @@ from cyclopts import Parameter
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Options, Overwrite, PathText, QualityOption, options_from
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.files.folders import make_folder
 from mbtf_core.paths import split_url
 from mbtf_gen.cli.generate import GenerateOptions, prepare_job, resolve_config
 from mbtf_gen.config.generator import GeneratorConfig
@@ -28,7 +27,6 @@ def inspect(
     *,
     options: InspectOptions = InspectOptions(),  # noqa: B008
     write: Annotated[Path | None, Parameter(metavar="FILE")] = None,
-    export: Annotated[Path | None, Parameter(metavar="FILE")] = None,
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
@@ -43,16 +41,12 @@ def inspect(
     write
         Store the height scale, tiling, resolution, normal convention and color space in a material.yaml, as
         given or as the maps suggest. Other commands then need no flags.
-    export
-        Write the heights in use, on the mesh and in tile widths, as an EXR file.
     """
     if split_url(material) is not None:
         hint = f"describe a data set with: mbtf-fit info {material}"
         raise UsageError("is a URL, but materials are local files", where=material, hint=hint)
     resolved = resolve_config(options, material)
-    _check_new(write, "--write", (".yaml", ".yml"), overwrite)
-    _check_new(export, "--export", (".exr",), overwrite)
-    from mbtf_core.images.exr import write_channels
+    _check_new(write, overwrite)
     from mbtf_gen.tile.choices import write_material_file
     from mbtf_gen.tile.loading import load_material
 
@@ -66,13 +60,6 @@ def inspect(
         written = load_material(write, max_pixels=geometry.max_pixels)
         loaded, finest = replace(written, unused=loaded.unused), None
         geometry = geometry.model_copy(update={"height_scale": None})
-    if export is not None:
-        grid = loaded.configured(geometry).grid
-        if grid is None:
-            raise UsageError("is for height maps", where="--export")
-        make_folder(export.parent)
-        write_channels(export, {"Y": grid.z.astype("float32")})
-        outputs["exported"] = export
     if loaded.bsdf_type is not None:
         from mbtf_gen.engine.runtime import load_mitsuba
 
@@ -86,12 +73,12 @@ def inspect(
     console.report(found, loaded.describe(found, resolved.material))
 
 
-def _check_new(path: Path | None, flag: str, suffixes: tuple[str, ...], overwrite: bool) -> None:
-    """Refuse an output file of another suffix, or one that exists."""
+def _check_new(path: Path | None, overwrite: bool) -> None:
+    """Refuse a material file of another suffix, or one that exists."""
     if path is None:
         return
-    if path.suffix.lower() not in suffixes:
-        raise UsageError(f"'{path}' must end in {' or '.join(suffixes)}", where=flag)
+    if path.suffix.lower() not in (".yaml", ".yml"):
+        raise UsageError(f"'{path}' must end in .yaml or .yml", where="--write")
     if path.exists() and not (overwrite and path.is_file()):
         hint = "--overwrite replaces it" if path.is_file() else "name a file"
         raise InputError("exists already", where=path, hint=hint)
@@ -124,16 +111,14 @@ def plan(
 
     job = prepare_job(options, material, quality)
     job.announce_briefly()
-    small = skips_pilots(job)
-    found = plan_effects(job, pilots=not small)
-    note = found.omitted_by(plan_effects(job)) if small else ""
+    found = plan_effects(job, pilots=not skips_pilots(job))
     if not measure:
-        console.report({**found.to_manifest(), "forecast": None}, found.describe(note))
+        console.report({**found.to_manifest(), "forecast": None}, found.describe())
         return
     from mbtf_gen.forecast import forecast
     from mbtf_gen.planning.run_plan import allocate, measured
 
     expected = forecast(job, allocate(job, found))
     found = measured(job, found)
-    text = f"{found.describe(note)}\n{expected.describe(split_target(job.config, 'train'))}"
+    text = f"{found.describe()}\n{expected.describe(split_target(job.config, 'train'))}"
     console.report({**found.to_manifest(), "forecast": asdict(expected)}, text)

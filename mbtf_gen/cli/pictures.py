@@ -6,7 +6,6 @@ from pathlib import Path
 
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import ClusterOption, Options, Output, Overwrite, PathText, options_from
-from mbtf_core.errors import InputError, UsageError
 from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.pictures import RENDERING, PreviewConfig, ReferenceConfig
 
@@ -34,33 +33,12 @@ def preview(
     Parameters
     ----------
     material
-        Height map, folder of maps, material.yaml, mesh, yarns or fibers; or a folder of shards, or its URL.
+        Height map, folder of maps, material.yaml, mesh, yarns or fibers.
     """
-    from mbtf_core.data.dataset import Dataset, is_dataset
-    from mbtf_core.data.folder import DataFolder
+    resolved = resolve_config(options, material)
     from mbtf_gen.pictures.preview import draw_preview
 
-    dataset = None
-    if material is not None and is_dataset(folder := DataFolder.open(material)):
-        dataset = Dataset.open(folder)
-        given = [options.flags[key] for key in options.given if not key.startswith(("preview.", "exposure"))]
-        given += ["--config"] * (options.config is not None) + ["--set"] * bool(options.assignments)
-        if given:
-            raise UsageError(
-                f"{material} holds a data set, whose configuration is fixed",
-                where=given[0],
-                hint="leave it out, or name the material instead of its shards",
-            )
-        if dataset.estimates == 1:
-            raise InputError(
-                "holds measured data, whose surface is unknown",
-                where=material,
-                hint="fit it, then: mbtf-fit preview MATERIAL",
-            )
-        resolved = options.resolve(**dataset.manifest["config"])
-    else:
-        resolved = resolve_config(options, material)
-    draw_preview(resolved, dataset, output, console, overwrite=overwrite)
+    draw_preview(resolved, output, console, overwrite=overwrite)
 
 
 @options_from(ReferenceConfig, "reference", "exposure", *RENDERING)

@@ -42,26 +42,14 @@ _working: set[str] = set()
 
 
 def load_mitsuba(variant: str = CPU_VARIANT) -> Any:
-    """Import Mitsuba and set a variant.
+    """Import Mitsuba and set a variant, ``llvm_ad_rgb`` or ``cuda_ad_rgb``; returns the module ``mitsuba``.
 
     Sets ``DRJIT_LIBLLVM_PATH`` and ``DRJIT_CACHE_DIR`` where they are unset.
 
-    Parameters
-    ----------
-    variant : str
-        ``llvm_ad_rgb`` or ``cuda_ad_rgb``.
-
-    Returns
-    -------
-    module
-        ``mitsuba``.
-
     Raises
     ------
-    UsageError
-        The variant does not exist.
-    EngineError
-        Mitsuba, its LLVM or the CUDA device cannot be used here; says why and what to do.
+    UsageError : the variant does not exist
+    EngineError : Mitsuba, its LLVM or the CUDA device cannot be used here; says why and what to do
     """
     if variant not in (CPU_VARIANT, CUDA_VARIANT):
         raise UsageError(f"no variant '{variant}'", hint=f"choose {CPU_VARIANT} or {CUDA_VARIANT}")

@@ -56,14 +56,9 @@ MEASURED_CONVENTIONS = {
 TEST_PAIRS = 0.05
 # Queries of a list that are read at once.
 _BLOCK = 1 << 22
-# First bytes of files: of zip archives, and of other archives and single compressed files.
-_ZIP = b"PK"
-_PACKED = (b"Rar!", b"7z\xbc\xaf", b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"\x28\xb5\x2f\xfd")
 _KNOWN = (
     "a .btf file (Bonn, DFMF), a folder or zip of photographs named by angles, or HDF5 of NeuMIP or NeuralBTF"
 )
-# The first bytes, which tell what a file is.
-_START = 1 << 10
 
 
 class Import(ABC):
@@ -97,12 +92,8 @@ class Import(ABC):
 
     @staticmethod
     def prepare(path: Path, config: ImportConfig) -> Import:
-        """Open a file or a folder.
-
-        Raises
-        ------
-        InputError : it is no measured BTF of a known format, is damaged, or has no usable values
-        """
+        """Open a file or a folder; an InputError if it is no measured BTF of a known format, is damaged, or
+        has no usable values."""
         source: Any = open_measured(path)
         kind = ImportOfImages if hasattr(source, "light") else ImportOfList
         return kind(path, config, source)
@@ -178,7 +169,6 @@ class ImportOfImages(Import):
         return min(self.requested(split), self.source.rows * self.source.columns * len(self.pairs[split]))
 
     def shards(self, finished: Callable[[ShardEntry], bool]) -> Iterator[tuple[ShardEntry, Arrays | None]]:
-        """Shards and their arrays; None for groups of finished shards."""
         source = self.source
         factor = np.full(len(source.light), self.config.scale, np.float32)
         if self.divides_by_cosine:
@@ -294,25 +284,8 @@ def import_measured(
     overwrite: bool = False,
     progress: Callable[[int], None] | None = None,
 ) -> Summary:
-    """Write a measured BTF as a data set, or finish an unfinished one.
-
-    Parameters
-    ----------
-    job : the measured BTF and the options
-    folder : output folder, or a URL
-    overwrite : replace the folder's data set
-    progress : called with the number of queries that are written
-
-    Returns
-    -------
-    Summary
-        Of the data set.
-
-    Raises
-    ------
-    InputError : the file is damaged, or the folder contains something else
-    PartialError : the folder cannot be written, or another process writes to it; the same command resumes
-    """
+    """Write a measured BTF as a data set, or finish an unfinished one; errors as of
+    :func:`~mbtf_gen.generation.run.generate`. `progress` is called with the number of queries written."""
     start = time.perf_counter()
     folder = DataFolder.open(folder)
     with owned(folder.workspace):
@@ -348,37 +321,22 @@ def _digest(path: Path) -> str:
 
 
 def open_measured(path: str | Path) -> MeasuredBtf | NeumipQueries:
-    """Open a measured BTF or a data set of another program.
-
-    Raises
-    ------
-    InputError : the file is missing, of no known kind, or damaged
-    """
+    """Open a measured BTF or a data set of another program; an InputError if the file is missing, of no known
+    kind, or damaged."""
     path = Path(path)
     if path.is_dir():
         return Ubo2003(path)
     with opened(path) as stream:
-        start = stream.read(_START)
+        start = stream.read(len(MAGIC))
     if start.startswith(b"!"):
         return Ubo2014(path)
-    if start.startswith(_ZIP):
+    if start.startswith(b"PK"):
         return Ubo2003(path)
     if not start.startswith(MAGIC):
-        raise _unknown(path, start)
+        what = "is not a measured BTF of a known kind"
+        raise InputError(what, where=path, hint=f"download or unpack it again; known are {_KNOWN}")
     with hdf5_file(path) as file:
         names = set(file)
     if COLOR not in names:
         raise InputError(f"is an HDF5 file without '{COLOR}'", where=path, hint=f"known are {_KNOWN}")
     return NeumipQueries(path) if RADIUS in names or "ground_valid" in names else NeuralBtf(path)
-
-
-def _unknown(path: Path, start: bytes) -> InputError:
-    """What a file is that no reader is for."""
-    text = start.removeprefix(b"\xef\xbb\xbf").lstrip().lower()
-    if not start:
-        return InputError("is empty", where=path, hint="download it again")
-    if text.startswith((b"<!doctype", b"<html", b"<?xml")):
-        return InputError("is a web page, not a measured BTF", where=path, hint="download the file again")
-    if start.startswith(_PACKED):
-        return InputError("is an archive that is not read", where=path, hint="unpack it and give the folder")
-    return InputError("is not a measured BTF of a known kind", where=path, hint=f"known are {_KNOWN}")

@@ -74,8 +74,6 @@ def new_manifest(
     ----------
     arrays : stored arrays, and their meanings where those of the schema do not apply
     splits : what is stated of each split besides its shards
-    entries : all shards
-    layout : of the queries
     others : further keys, or other values of some
     """
     config, lattice = source.config.model_dump(mode="json"), source.lattice
@@ -180,12 +178,9 @@ class Summary:
     complete : whether all shards of the manifest are finished
     queries, splits : queries in finished shards: of all splits, and by split
     paths, seconds, paths_per_second : paths traced in this run, its duration, their ratio
-    writing_seconds : processor time of writing and digesting in this run, parallel to the rendering
-    waiting_seconds : time that rendering waited for the writer
     shard_seconds : rendering time of all finished shards, over all runs
     relative_error : pooled relative standard error of the training values, √(mean variance) / mean value;
         None where their noise is unknown
-    relative_error_se : standard error of `relative_error`; None of fewer than four shards
     mean_value : mean training value per channel, 1/sr
     lost, capped, nonfinite : rays that slipped through the surface, rays cut at the cap on tile crossings,
         and non-finite samples that were sampled again, over all shards
@@ -202,11 +197,8 @@ class Summary:
     paths: int
     seconds: float
     paths_per_second: float
-    writing_seconds: float
-    waiting_seconds: float
     shard_seconds: float
     relative_error: float | None
-    relative_error_se: float | None
     mean_value: list[float]
     lost: int
     capped: int
@@ -216,19 +208,8 @@ class Summary:
     measured: bool = False
 
 
-def finish(
-    folder: str | Path | DataFolder,
-    *,
-    paths: int = 0,
-    seconds: float = 0.0,
-    writing: float = 0.0,
-    waiting: float = 0.0,
-) -> Summary:
+def finish(folder: str | Path | DataFolder, *, paths: int = 0, seconds: float = 0.0) -> Summary:
     """Complete the manifest if every shard is finished, and summarize (``mbtf-gen merge``).
-
-    Parameters
-    ----------
-    paths, seconds, writing, waiting : of the run that ends, see :class:`Summary`
 
     Raises
     ------
@@ -273,12 +254,9 @@ def finish(
         paths=paths,
         seconds=round(seconds, 3),
         paths_per_second=round(paths / seconds, 1) if seconds > 0 else 0.0,
-        writing_seconds=round(writing, 3),
-        waiting_seconds=round(waiting, 3),
         lost=totals.counts["lost_rays"],
         capped=totals.counts["capped_rays"],
         nonfinite=totals.counts["nonfinite_samples"],
-        relative_error_se=totals.relative_error_se(),
         effects=[EFFECTS[e.name].description for e in effects if e.on],
         measured=measured,
         **sums,

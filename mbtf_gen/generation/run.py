@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections import Counter
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -65,7 +63,6 @@ def generate(
     overwrite: bool = False,
     slice_index: int = 1,
     slice_count: int = 1,
-    planned: Callable[[RunPlan], None] | None = None,
     progress: ProgressCallback | None = None,
     runner: Runner | None = None,
 ) -> Summary:
@@ -86,8 +83,6 @@ def generate(
         because another slice may have begun it.
     slice_index, slice_count : int
         Generate every `slice_count`-th shard only, starting with number `slice_index`, from 1.
-    planned : callable, optional
-        Called with the run's plan. A new data set is not yet written then.
     progress : callable, optional
         Called at the begin of each phase, and after every launch of this process and every shard, with the
         paths of this run so far, a note, and the paths that the run is expected to trace (None where a
@@ -120,25 +115,16 @@ def generate(
     if job is not source:
         job.announce()
     overwrite = overwrite and not (slice_count > 1 and has_dataset(folder, job.config_hash))
-    plans: list[RunPlan] = []
 
-    def new_plan(job: Job) -> RunPlan:
-        def note(phase: str) -> None:
-            if progress is not None:
-                progress(0.0, phase, None)
+    def note(phase: str) -> None:
+        if progress is not None:
+            progress(0.0, phase, None)
 
-        plans.append(plan_run(job, note))
-        if planned is not None:
-            note("forecasting the time")
-            planned(plans[0])
-        return plans[0]
-
-    run = ShardRun(job, folder, open_folder(job, folder, new_plan, overwrite))
+    plan = open_folder(job, folder, lambda job: plan_run(job, note), overwrite)
     entries = unfinished(job, folder, slice_index, slice_count)
-    if planned is not None and not plans and entries:
-        planned(run.plan)
-    traced = render_shards(run, entries, runner or Runner(), progress=progress)
-    summary = finish(folder, seconds=time.perf_counter() - start, **vars(traced))
+    run = ShardRun(job, folder, plan)
+    paths = render_shards(run, entries, runner or Runner(), progress=progress)
+    summary = finish(folder, paths=paths, seconds=time.perf_counter() - start)
     if slice_count == 1 and not summary.complete:
         raise PartialError(
             "finished shards are missing or cannot be read",
@@ -230,8 +216,7 @@ def received_run(config: str, config_hash: str, folder: str, digest: str) -> Sha
 def render_shard(run: ShardRun, entry: ShardEntry) -> Generator[None, None, dict[str, Any]]:
     """Render one shard into its folder, unless it is finished; a task in three parts.
 
-    Returns ``record`` (the sidecar), ``rendered`` (whether this call rendered it), ``writing`` (processor
-    seconds of writing and digesting).
+    Returns ``record`` (the sidecar) and ``rendered`` (whether this call rendered it).
 
     Raises
     ------
@@ -239,14 +224,14 @@ def render_shard(run: ShardRun, entry: ShardEntry) -> Generator[None, None, dict
     PartialError : the disk is full, or the store cannot be reached
     """
     if (record := run.finished(entry)) is not None:
-        return {"record": record, "rendered": False, "writing": 0.0}
+        return {"record": record, "rendered": False}
     lock = take_lock(run.folder.workspace / entry.file)
     if lock is None:
         raise LockedError("is being written by another process", where=run.folder.at(entry.file))
     try:
         # Another process may have finished it since.
         if (record := run.finished(entry)) is not None:
-            return {"record": record, "rendered": False, "writing": 0.0}
+            return {"record": record, "rendered": False}
         queries, weight = run.draw(entry)
         yield
         began, config = time.perf_counter(), run.job.config
@@ -264,21 +249,9 @@ def render_shard(run: ShardRun, entry: ShardEntry) -> Generator[None, None, dict
         )
         seconds = time.perf_counter() - began
         yield
-        began = time.thread_time()
-        record = run.store(entry, queries, estimates, seconds, weight)
-        return {"record": record, "rendered": True, "writing": time.thread_time() - began}
+        return {"record": run.store(entry, queries, estimates, seconds, weight), "rendered": True}
     finally:
         lock.release()
-
-
-@dataclass
-class Traced:
-    """Work of :func:`render_shards`: paths traced, processor seconds of writing and digesting parallel to
-    rendering, and seconds that this process waited for the writing."""
-
-    paths: int = 0
-    writing: float = 0.0
-    waiting: float = 0.0
 
 
 def render_shards(
@@ -287,51 +260,29 @@ def render_shards(
     runner: Runner,
     *,
     progress: ProgressCallback | None = None,
-) -> Traced:
-    """Render those of the shards that are not finished.
-
-    Parameters
-    ----------
-    runner : maps :func:`render_shard` over the shards
-    progress : as of :func:`generate`. Paths per second count from the end of the first launch or shard, once
-        there are others: it compiles the kernels
-
-    Raises
-    ------
-    InputError : a worker cannot read the material or the folder
-    PartialError : other processes render some of them, shards failed, the disk is full, the store or the
-        workers cannot be reached, or there are too many non-finite samples; finished shards are kept
-    """
-    start, first = time.perf_counter(), 0
-    began = start
-    job, folder = run.job, run.folder
-    pending = {entry.file: entry for entry in entries}
-    traced, totals, limit = Traced(), ShardStatistics(), most_paths(job)
+) -> int:
+    """Render those of the shards that are not finished; returns the number of paths traced. Errors are those
+    of :func:`generate`; finished shards are kept."""
+    start, job, folder = time.perf_counter(), run.job, run.folder
+    totals, limit = ShardStatistics(), most_paths(job)
     # Leftovers of killed runs take disk space.
     folder.remove_leftovers()
     upload_waiting(folder, job.shards, job.config_hash, run.digest)
-    items = [Item(file, {"run": run, "entry": entry}) for file, entry in pending.items()]
-    busy, failed, row = list[str](), list[Result](), 0
-    planned_so_far, traced_so_far = Counter[str](), Counter[str]()
-    launched = 0
+    items = [Item(entry.file, {"run": run, "entry": entry}) for entry in entries]
+    expected = None if job.config.queries.target_error is not None else planned_paths(job, entries)
+    busy, failed, row, left = list[str](), list[Result](), 0, len(items)
+    traced = launched = 0
 
     def show() -> None:
-        """Report the paths so far, and their rate."""
-        nonlocal start, first
+        """Report the paths so far, their rate, and the noise of the training values."""
         if progress is None:
             return
-        now, paths = time.perf_counter(), max(traced.paths, launched)
-        # Without the first launch, which compiles; small ones that end together say nothing yet.
-        since, before = (start, first) if now - start >= 1.0 else (began, 0)
-        rate = (paths - before) / max(now - since, 1e-9)
-        if not first:
-            start, first = now, paths
+        paths = max(traced, launched)
+        rate = rate_text(paths / max(time.perf_counter() - start, 1e-9))
         where = "" if runner.here else f" on {runner.workers} workers"
         noise = totals.relative_error() if totals.train else None
-        error = "" if noise is None else f", noise {noise:.2%}"
-        left = _expected_paths(job, list(pending.values()), planned_so_far, traced_so_far)
-        total = None if left is None else max(traced.paths + left, paths)
-        progress(paths, f"{rate_text(rate)}{where}{error}", total)
+        total = None if expected is None else max(expected, paths)
+        progress(paths, f"{rate}{where}{'' if noise is None else f', noise {noise:.2%}'}", total)
 
     def observe(paths: int) -> None:
         nonlocal launched
@@ -351,17 +302,12 @@ def render_shards(
                 if row >= (1 if runner.here else max(_FAILURES, 2 * runner.workers)):
                     break
             else:
-                row, entry = 0, pending.pop(done.name)
+                row, left = 0, left - 1
                 totals.add(done.value["record"])
                 totals.refuse_nonfinite(limit, folder)
-                traced.writing += done.value["writing"]
-                traced.waiting = done.waited
-                if done.value["rendered"]:
-                    traced.paths += (paths := done.value["record"]["paths"])
-                    planned_so_far[entry.split] += planned_paths(job, [entry])
-                    traced_so_far[entry.split] += paths
+                traced += done.value["record"]["paths"] if done.value["rendered"] else 0
             show()
-    _refuse_failed(failed, len(pending), runner, folder)
+    _refuse_failed(failed, left, runner, folder)
     if busy:
         owner = lock_owner(folder.workspace / busy[0])
         who = "" if owner is None else f" ({owner})"
@@ -371,20 +317,6 @@ def render_shards(
             hint="wait for it, then run the same command again",
         )
     return traced
-
-
-def _expected_paths(
-    job: Job, pending: Sequence[ShardEntry], planned: Counter[str], traced: Counter[str]
-) -> float | None:
-    """Paths of shards to come: those planned, times the ratio of traced and planned paths of the split so
-    far. None where a target error decides, and no shard is done."""
-    total = 0.0
-    for split in {entry.split for entry in pending}:
-        if not planned[split] and split_target(job.config, split) is not None:
-            return None
-        ratio = traced[split] / planned[split] if planned[split] else 1.0
-        total += ratio * planned_paths(job, [entry for entry in pending if entry.split == split])
-    return round(total)
 
 
 def _refuse_failed(failed: Sequence[Result], left: int, runner: Runner, folder: DataFolder) -> None:

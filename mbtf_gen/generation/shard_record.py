@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -17,7 +16,6 @@ from mbtf_core.data.schema import ShardEntry
 from mbtf_core.data.shard_files import Arrays, write_shard
 from mbtf_core.errors import PartialError
 from mbtf_core.files.atomic import Stored
-from mbtf_core.stats import pooled_relative_error
 from mbtf_gen.render.estimates import Estimates
 
 # A run fails beyond this share of non-finite samples, but never for so few: with one expected, more than four
@@ -25,8 +23,6 @@ from mbtf_gen.render.estimates import Estimates
 NONFINITE_SHARE = 1e-6
 NONFINITE_FEW = 4
 _SHOWN = 3
-# Fewest shards whose spread is an error.
-_SPREAD = 4
 
 
 def store_shard(
@@ -41,21 +37,11 @@ def store_shard(
     estimates: Estimates | None = None,
     seconds: float = 0.0,
 ) -> dict[str, Any]:
-    """Write a shard, then its sidecar.
+    """Write a shard, then its sidecar, which is returned; errors as of
+    :meth:`~mbtf_core.data.folder.DataFolder.write_shard`.
 
-    Parameters
-    ----------
-    arrays : of the shard; without ``value_b``, values are measured and their noise is unknown
-    config_hash, plan : digests of the configuration and of the run plan
-    seed : root seed
-    spp : planned paths of a query; None of measured values
-    estimates : where the values come from; None of measured values
-    seconds : duration of the rendering
-
-    Returns
-    -------
-    dict
-        The sidecar. Errors are those of :meth:`~mbtf_core.data.folder.DataFolder.write_shard`.
+    `config_hash` and `plan` are digests. Measured values have no ``value_b``, for their noise is unknown, no
+    `spp` (the planned paths of a query), and no `estimates`.
     """
     halves = [arrays[name].reshape(-1, 3) for name in ("value_a", "value_b") if name in arrays]
     mean = sum(half.mean(axis=0, dtype=np.float64) for half in halves) / len(halves)
@@ -109,8 +95,6 @@ class ShardStatistics:
         self.located: list[str] = []
         self._value = np.zeros(3)
         self._variance: NDArray[np.float64] | None = np.zeros(3)
-        # Queries, value and root of the variance of each shard, means over the channels.
-        self._shards: list[tuple[int, float, float]] = []
         self._targeted = self._missed = 0
         self._worst = self._square = 0.0
 
@@ -135,8 +119,6 @@ class ShardStatistics:
                 self._variance = None
             else:
                 self._variance = self._variance + record["queries"] * np.asarray(variance)
-                value, noise = np.mean(record["statistics"]["mean_value"]), math.sqrt(np.mean(variance))
-                self._shards.append((record["queries"], float(value), noise))
 
     @property
     def train(self) -> int:
@@ -167,14 +149,6 @@ class ShardStatistics:
         mean = float(self._value.mean()) / max(self.train, 1)
         variance = float(self._variance.mean()) / max(self.train, 1)
         return float(np.sqrt(variance)) / mean if mean > 0 else 0.0
-
-    def relative_error_se(self) -> float | None:
-        """Standard error of :meth:`relative_error` by the spread of the shards; None of fewer than four."""
-        if self._variance is None or len(self._shards) < _SPREAD:
-            return None
-        queries, value, noise = np.array(self._shards).T
-        error = pooled_relative_error(value + noise, value - noise, queries).error
-        return error if math.isfinite(error) else None
 
     def refuse_nonfinite(self, paths: int, folder: object) -> None:
         """Fail if there are more non-finite samples than a data set of `paths` may have."""

@@ -26,22 +26,9 @@ def mean_of(arrays: Arrays) -> NDArray[np.float32]:
 
 
 def export_neumip(data: Dataset, path: Path) -> int:
-    """Write the training queries for NeuMIP's code, which trains on whole images of them.
-
-    Parameters
-    ----------
-    data : of the shuffled layout, of a square tile
-    path : it is replaced only once all queries are written
-
-    Returns
-    -------
-    int
-        Queries written. The last ones that do not fill an image are left out.
-
-    Raises
-    ------
-    InputError : the data set is another, or a shard cannot be read
-    """
+    """Write the training queries of a data set, shuffled and of a square tile, for NeuMIP's code, which
+    trains on whole images of them. Returns the number of queries written: the last ones that do not fill an
+    image are left out. Errors are an InputError; the path is replaced only once all queries are written."""
     if data.layout != "shuffled":
         raise InputError(
             f"has the {data.layout} layout, but NeuMIP learns from shuffled queries",
@@ -98,22 +85,8 @@ def _neumip_queries(arrays: Arrays) -> Arrays:
 
 
 def export_neural_btf(data: Dataset, path: Path) -> int:
-    """Write the images of all pairs of light and view for NeuralBTF's code.
-
-    Parameters
-    ----------
-    data : of the slices layout
-    path : it is replaced only once all images are written
-
-    Returns
-    -------
-    int
-        Values written.
-
-    Raises
-    ------
-    InputError : the data set has no such images, or a shard cannot be read
-    """
+    """Write the images of all pairs of light and view of a data set of the slices layout for NeuralBTF's
+    code. Returns the number of values written; errors and path as of :func:`export_neumip`."""
     if data.layout != "slices":
         raise InputError(
             f"has the {data.layout} layout, but NeuralBTF learns from images under fixed lights and views",

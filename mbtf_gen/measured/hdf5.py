@@ -66,12 +66,7 @@ _MOST_RATIO, _ANY_FILE_BYTES = 100, 1 << 26
 
 @contextmanager
 def hdf5_file(path: Path) -> Iterator[Any]:
-    """The h5py file of a path; whatever the library raises within becomes an InputError.
-
-    Raises
-    ------
-    InputError : the file is missing, is not HDF5, is truncated or damaged
-    """
+    """The h5py file of a path; whatever the library raises within becomes an InputError."""
     h5py = import_extra("h5py", path)
     try:
         # A chunk that images share is decompressed once.
@@ -84,12 +79,8 @@ def hdf5_file(path: Path) -> Iterator[Any]:
 
 
 def data_set(file: Any, name: str, path: Path) -> Any:
-    """A data set of floats in the root of a file, with every number stored in this file.
-
-    Raises
-    ------
-    InputError : it is missing, leads to another file, has no floats, or has parts that were never written
-    """
+    """A data set of floats in the root of a file, with every number stored in this file; else an
+    InputError."""
     h5py = import_extra("h5py", path)
     found = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
     if not isinstance(found, h5py.Dataset) or found.is_virtual or found.external:
@@ -104,12 +95,6 @@ def data_set(file: Any, name: str, path: Path) -> Any:
     if size > _MOST_RATIO * stored + _ANY_FILE_BYTES:
         what = f"claims {size:,} bytes of '{name}' in a file of {stored:,}"
         raise InputError(what, where=path, hint=COMPLETE)
-    properties = found.id.get_create_plist()
-    filters = [properties.get_filter(k) for k in range(properties.get_nfilters())]
-    foreign = next((f for f in filters if not h5py.h5z.filter_avail(f[0])), None)
-    if foreign is not None:
-        what = f"has '{name}' stored by the HDF5 filter {foreign[0]} ({reason(foreign[3].decode('latin-1'))})"
-        raise InputError(what, where=path, hint="store it with gzip or without: h5repack -f GZIP=4 IN OUT")
     if found.chunks is None:
         unit, total, stored = "bytes", found.size * found.dtype.itemsize, found.id.get_storage_size()
     else:
@@ -135,10 +120,6 @@ class NeumipQueries:
     ----------
     count : queries of the file
     base_radius : sigma of the finest level in tile widths; None where neither the file nor its shape says it
-
-    Raises
-    ------
-    InputError : not HDF5, a data set is missing or has another shape, or it is the rendering of a scene
     """
 
     def __init__(self, path: Path) -> None:
@@ -212,12 +193,7 @@ class NeumipQueries:
 
 
 class NeuralBtf(ImageBtf):
-    """A capture of NeuralBTF, opened; of an image the rows from the first to the last texel are read.
-
-    Raises
-    ------
-    InputError : not HDF5, a data set is missing or has another shape, or a direction is NaN
-    """
+    """A capture of NeuralBTF, opened; of an image the rows from the first to the last texel are read."""
 
     def __init__(self, path: Path) -> None:
         directions = {}

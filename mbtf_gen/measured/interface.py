@@ -58,17 +58,8 @@ class MeasuredBtf(ABC):
         self.light, self.view, self.left_out = light[above], view[above], int((~above).sum())
 
     def values(self, pair: I64, texel: I64) -> F32:
-        """Values at texels (n,), row-major, of pairs (n,); each image is decoded once per call.
-
-        Returns
-        -------
-        (n, 3) float32 array
-            As stored, linear RGB with Rec.709 primaries.
-
-        Raises
-        ------
-        InputError : the file cannot be read, or one of the values is NaN or infinite
-        """
+        """Values (n, 3) at texels (n,), row-major, of pairs (n,), as stored, linear RGB with Rec.709
+        primaries; each image is decoded once per call. An InputError if one is NaN or infinite."""
         out = self._values(self._number[pair], np.asarray(texel))
         bad = int((~np.isfinite(out).all(axis=-1)).sum())
         if bad:

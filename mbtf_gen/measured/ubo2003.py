@@ -38,8 +38,6 @@ _ANGLES = tuple(
     re.compile(rf"(?<![a-z]){letters}(\d{{1,3}}(?:\.\d+)?)") for letters in ("tl", "pl", "tv", "pv")
 )
 _EXAMPLE = "a name has the angles of the light and the viewer: tl015 pl060 tv030 pv090.jpg"
-# Files of other readers, which may lie in a folder or an archive.
-_WHOLE = (".hdf5", ".h5", ".btf", ".zip")
 _MOST_FILES = 200_000
 # Largest file of an image, and the largest ratio to its compressed size in an archive.
 _MOST_BYTES = 1 << 28
@@ -53,13 +51,8 @@ Content = Callable[[str], bytes]
 
 
 class Ubo2003(ImageBtf):
-    """Photographs in a folder, which may have sub-folders, or in a zip archive. Nothing is unpacked to disk.
-
-    Raises
-    ------
-    InputError : no image is named by its directions, two have the same, there are too many, or the first
-        cannot be decoded
-    """
+    """Photographs in a folder, which may have sub-folders, or in a zip archive. Nothing is unpacked to
+    disk."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -166,10 +159,6 @@ def _short(name: str) -> str:
 def _without_photographs(names: Sequence[str], path: Path) -> InputError:
     """What is wrong with files of which none is a photograph named by its directions."""
     what = "has no images that are named by their directions"
-    if whole := [name for name in names if name.lower().endswith(_WHOLE)]:
-        unpacked = "" if path.is_dir() else "unpack it and "
-        hint = f"{unpacked}give a file in it, such as '{_short(whole[0])}'"
-        return InputError(what, where=path, hint=hint)
     what += f", but files such as '{_short(names[0])}'" if names else ""
     return InputError(what, where=path, hint=f"{', '.join(SUFFIXES)} are read; {_EXAMPLE}")
 
@@ -214,10 +203,6 @@ def _members_of(path: Path) -> list[str]:
         if angles_of(entry.filename) is None:
             continue
         name = _short(entry.filename)
-        if entry.flag_bits & 1:
-            raise InputError(
-                f"'{name}' is encrypted", where=path, hint="unpack the archive and give the folder"
-            )
         if entry.file_size > min(_MOST_BYTES, _MOST_RATIO * entry.compress_size + 10_000):
             raise InputError(
                 f"'{name}' claims {entry.file_size:,} bytes in {entry.compress_size:,}", where=path
@@ -230,12 +215,10 @@ def _read_member(archive: zipfile.ZipFile, name: str, path: Path) -> bytes:
         entry = archive.getinfo(name)
         with archive.open(entry) as stream:
             data = stream.read(entry.file_size + 1)
-    except NotImplementedError as error:
-        what, hint = f"'{_short(name)}' cannot be unpacked ({reason(error)})", "unpack it and give the folder"
-        raise InputError(what, where=path, hint=hint) from None
     except Exception as error:  # a damaged archive may make the library raise anything
         what = f"'{_short(name)}' cannot be unpacked ({reason(error)})"
-        raise InputError(what, where=path, hint=COMPLETE) from None
+        hint = f"{COMPLETE}, or unpack it and give the folder"
+        raise InputError(what, where=path, hint=hint) from None
     if len(data) != entry.file_size:
         what = f"'{_short(name)}' has another size than the archive claims"
         raise InputError(what, where=path, hint=COMPLETE)

@@ -96,12 +96,8 @@ class _Cursor:
 
 
 class Ubo2014(MeasuredBtf):
-    """A DFMF file, opened; its factors stay on disk, and of no image more than the asked texels is computed.
-
-    Raises
-    ------
-    InputError : not a DFMF file, truncated, inconsistent, or of a kind that cannot be converted to RGB
-    """
+    """A DFMF file, opened; its factors stay on disk, and of no image more than the asked texels is
+    computed."""
 
     at_once = 1 << 20
 

@@ -6,31 +6,26 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.app.console import Console
 from mbtf_core.color import brightness, chosen_exposure, describe_exposure
-from mbtf_core.data.dataset import Dataset
 from mbtf_core.directions import from_angles
-from mbtf_core.errors import InputError, PartialError
+from mbtf_core.errors import PartialError
 from mbtf_core.extras import extra_error, has_extra
 from mbtf_core.files.folders import check_space, owned
 from mbtf_core.pictures import PNG_BYTES, Camera, claim_pictures, tiles_camera, write_display
-from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.stats import pooled_relative_error
 from mbtf_core.units import rate_text
 from mbtf_gen.config.pictures import PreviewConfig
-from mbtf_gen.forecast import announce
 from mbtf_gen.job import Job
 from mbtf_gen.pictures import mesh
-from mbtf_gen.pictures.query_plots import sampled_queries, stored_queries, write_plots
+from mbtf_gen.pictures.query_plots import write_plots
 from mbtf_gen.pictures.reference import (
     note_fine_pixels,
     picture_estimator,
-    picture_seconds,
     render_reference,
 )
 
@@ -46,24 +41,15 @@ class _Scene:
     job: Job
     camera: Camera
     omega_i: NDArray[np.float64]
-    console: Console
     size: int
     spp: int
 
-    def beauty(self, file: Path, advance: Callable[[float, str], None]) -> dict[str, Any]:
-        """Write the path-traced picture; returns what it shows, its noise, and its exposure. `advance` is
-        called with the share of its paths that are traced, and their rate."""
+    def beauty(self, file: Path, advance: Callable[[float, str], None]) -> tuple[str, float]:
+        """Write the path-traced picture; returns what it shows, and its exposure. `advance` is called with
+        the share of its paths that are traced, and their rate."""
         advance(0.0, "building the scene, compiling kernels")
         estimator = picture_estimator(self.job)
         paths = self.camera.rows * self.camera.columns * self.spp
-        announce(
-            self.console,
-            paths,
-            lambda: picture_seconds(estimator, self.camera, self.omega_i, paths),
-            PNG_BYTES * self.size**2,
-            self.job.material.scatters,
-            f"--size {max(64, self.size // 2)}, --spp {max(2, self.spp // 4 * 2)}",
-        )
         traced, began = 0, time.perf_counter()
 
         def observe(count: int) -> None:
@@ -83,129 +69,72 @@ class _Scene:
             f"the infinite plane from the same camera, path-traced with {self.spp} paths per pixel, noise "
             f"{noise:.0%} of the mean value{more}"
         )
-        return {"shows": shows, "relative_noise": noise, "exposure": exposure}
+        return shows, exposure
 
-    def mesh(self, file: Path, exposure: float) -> dict[str, Any]:
-        """Write the picture of the mesh; returns what it shows and its exposure, or the ``fault``."""
+    def mesh(self, file: Path, exposure: float) -> tuple[str, str]:
+        """Write the picture of the mesh; returns what it shows, and why it could not be drawn, or ""."""
         options = self.config.preview
         drawn = mesh.tiled_mesh(self.job.material, options.tiles, exposure)
-        if fault := mesh.draw(drawn, self.camera, self.omega_i, file):
-            return {"fault": fault}
         view, light, (rows, columns) = options.view, options.light, drawn.cells
-        return {
-            "shows": f"the displaced mesh ({columns} x {rows} cells per tile) of {options.tiles} x "
-            f"{options.tiles} tiles with its base color, from elevation {view.elevation:g}, azimuth "
-            f"{view.azimuth:g}, light from {light.elevation:g}, {light.azimuth:g} degrees",
-            "exposure": exposure,
-        }
+        shows = (
+            f"the displaced mesh ({columns} x {rows} cells per tile) of {options.tiles} x {options.tiles} "
+            f"tiles with its base color, from elevation {view.elevation:g}, azimuth {view.azimuth:g}, light "
+            f"from {light.elevation:g}, {light.azimuth:g} degrees"
+        )
+        return shows, mesh.draw(drawn, self.camera, self.omega_i, file)
 
 
-def draw_preview(
-    config: PreviewConfig,
-    dataset: Dataset | None,
-    path: Path,
-    console: Console,
-    *,
-    overwrite: bool = False,
-) -> None:
-    """Draw the missing pictures of a material or a data set, and report them.
-
-    Parameters
-    ----------
-    config : options of the pictures and of the material
-    dataset : data set whose queries are shown; without one, those that a run would draw
-    path : folder of the pictures
-    console : where notes and results go
-    overwrite : replace the pictures of another configuration
+def draw_preview(config: PreviewConfig, path: Path, console: Console, *, overwrite: bool = False) -> None:
+    """Draw the pictures of a material in a folder, and report them.
 
     Raises
     ------
-    InputError
-        The material cannot be read, and there is no data set either; or the folder holds something else.
+    InputError : the material cannot be read, or the folder holds something else
     UsageError : the view shows the horizon
     PartialError : the mesh could not be drawn; everything else was
     """
-    scene = _scene(config, dataset, console)
-    inputs: dict[str, str] = {}
-    # What each picture depends on beside the configuration, in the order of the report.
-    states: dict[str, Any] = {"queries": 0}
-    if dataset is not None:
-        inputs["data set"] = dataset.manifest["config_hash"]
-        states["queries"] = len(dataset.shards("train", finished_only=True))
-    if scene is not None:
-        config = scene.config
-        states = {"mesh": config.exposure, "beauty": config.exposure, **states}
-        if scene.job.material.grid is None:
-            del states["mesh"]
-        note_fine_pixels([scene.camera], scene.job.lattice, console)
-        inputs |= scene.job.material.digests
-    size = len(states) * PNG_BYTES * config.preview.sizes(fibers=False)[0] ** 2
+    scene = _scene(config)
+    material, exposure, fault = scene.job.material, 0.0, ""
+    names = ["beauty", "queries"] if material.grid is None else ["mesh", "beauty", "queries"]
+    files, shown = {name: path / f"{name}.png" for name in names}, dict[str, str]()
+    note_fine_pixels([scene.camera], scene.job.lattice, console)
+    size = len(names) * PNG_BYTES * scene.size**2
     check_space(path, size, "reduce --size, or choose another folder with -o")
-    keep_on_interruption(f"the finished pictures are kept in {path}")
-    found: dict[str, dict[str, Any]] = {}
-    with owned(path), console.progress(len(states), "drawing", "pictures") as bar:
-        folder = claim_pictures(
+    with owned(path), console.progress(len(names), "drawing", "pictures") as bar:
+        claim_pictures(
             path,
             "mbtf-gen preview",
-            files=[f"{name}.png" for name in states],
-            config=config.model_dump(mode="json"),
-            inputs=inputs,
+            files=[file.name for file in files.values()],
+            config=scene.config.model_dump(mode="json"),
+            inputs=material.digests,
             overwrite=overwrite,
         )
-
-        def draw(name: str, maker: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
-            """Facts of a picture, which is drawn unless it is finished."""
-            file, facts = path / f"{name}.png", folder.finished(name, of=states[name])
-            kept = facts is not None
-            if facts is None:
-                facts = {**maker(file), "of": states[name]}
-                if "fault" not in facts:
-                    folder.keep(name, [file], facts)
-            bar.update(len(found) + 1, "")
-            found[name] = {"file": file, "kept": kept} | {k: v for k, v in facts.items() if k != "of"}
-            return found[name]
-
-        if scene is not None:
-            # The mesh has the exposure of the path-traced picture.
-            def beauty(file: Path) -> dict[str, Any]:
-                return scene.beauty(file, lambda share, note: bar.update(round(share, 2), note))
-
-            exposure = draw("beauty", beauty)["exposure"]
-            if "mesh" in states:
-                draw("mesh", lambda file: scene.mesh(file, exposure))
-        draw("queries", lambda file: _queries(file, scene, dataset))
-    fault = found.get("mesh", {}).get("fault")
-    pictures = [found[name] for name in states if "fault" not in found[name]]
-    lines = [f"{p['file']}: {p['shows']}{' (kept)' if p['kept'] else ''}" for p in pictures]
-    if scene is not None:
-        lines.append(describe_exposure(exposure))
-    console.report({"folder": path, "pictures": pictures, "fault": fault}, "\n".join(lines))
+        shown["beauty"], exposure = scene.beauty(
+            files["beauty"], lambda share, note: bar.update(round(share, 2), note)
+        )
+        if "mesh" in files:
+            # It has the exposure of the path-traced picture.
+            shown["mesh"], fault = scene.mesh(files["mesh"], exposure)
+        shown["queries"] = write_plots(files["queries"], scene.job)
+        bar.update(len(names), "")
+    drawn = [name for name in names if not (name == "mesh" and fault)]
+    text = "\n".join([*(f"{files[name]}: {shown[name]}" for name in drawn), describe_exposure(exposure)])
+    pictures = [{"file": files[name], "shows": shown[name]} for name in drawn]
+    console.report({"folder": path, "pictures": pictures, "exposure": exposure, "fault": fault or None}, text)
     if fault and not has_extra("pyvista"):
-        missing = extra_error("pyvista", path / "mesh.png")
+        missing = extra_error("pyvista", files["mesh"])
         console.note(f"note: {missing.where} is not drawn: {missing.what}; {missing.hint}")
     elif fault:
         raise PartialError(
             f"could not be drawn ({fault})",
-            where=path / "mesh.png",
-            hint="the other pictures are finished; mbtf-gen doctor names the missing package, "
-            "then the same command draws it",
+            where=files["mesh"],
+            hint="the other pictures are finished; mbtf-gen doctor names the missing package",
         )
 
 
-def _scene(config: PreviewConfig, dataset: Dataset | None, console: Console) -> _Scene | None:
-    """The scene of the 3D pictures; None with a data set whose material cannot be read."""
-    options = config.preview
-    try:
-        job = Job.load(config)
-        if dataset is None:
-            job.announce_briefly()
-        elif job.material.digests != dataset.manifest["inputs"]:
-            raise InputError("has changed since the data set was made", where=config.material)
-    except InputError as error:
-        if dataset is None:
-            raise
-        console.note(f"only the queries are drawn: {error.where}: {error.what}")
-        return None
+def _scene(config: PreviewConfig) -> _Scene:
+    options, job = config.preview, Job.load(config)
+    job.announce_briefly()
     size, spp = options.sizes(job.material.scatters)
     camera = tiles_camera(
         options.view.elevation,
@@ -219,16 +148,4 @@ def _scene(config: PreviewConfig, dataset: Dataset | None, console: Console) -> 
     camera.queries(omega_i, job.material.aspect)  # refuses a view of the horizon
     options = options.model_copy(update={"size": size, "spp": spp})
     config = config.model_copy(update={**dict(job.config), "preview": options})
-    return _Scene(config, job, camera, omega_i, console, size, spp)
-
-
-def _queries(file: Path, scene: _Scene | None, dataset: Dataset | None) -> dict[str, Any]:
-    """Write the plots of the queries; returns what they show."""
-    if dataset is not None:
-        sample, source = stored_queries(dataset), f"stored in {dataset.folder}"
-    else:
-        assert scene is not None
-        sample, source = sampled_queries(scene.job), f"sampled for {scene.config.material}"
-    shown = f"{sample.queries.sigma.size} of {sample.total} training queries {source}"
-    write_plots(file, sample, shown)
-    return {"shows": f"positions, levels and directions of {shown}"}
+    return _Scene(config, job, camera, omega_i, size, spp)

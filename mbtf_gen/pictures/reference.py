@@ -7,16 +7,13 @@ A picture is stored as an EXR image with the channels of the shard schema (``u.x
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from mbtf_core.app.console import Console
 from mbtf_core.color import brightness, chosen_exposure, describe_exposure
@@ -43,7 +40,6 @@ from mbtf_core.run.task import Item
 from mbtf_core.stats import pooled_relative_error
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.pictures import ReferenceConfig, ReferenceSection, Shape, ViewSection
-from mbtf_gen.forecast import announce
 from mbtf_gen.job import Job
 from mbtf_gen.pictures.displaced_mesh import DisplacedMesh
 from mbtf_gen.pictures.shapes import Chart, render_shape
@@ -55,8 +51,6 @@ if TYPE_CHECKING:
 
 # Pixels that cover less of a texel are finer than the data; 1 but for rounding.
 _TEXEL = 0.99
-# Shortest time of a picture that others are extrapolated from; shorter ones leave processors idle.
-_PILOT_SECONDS = 0.5
 _kept: tuple[Job, Any] | None = None
 
 
@@ -99,20 +93,6 @@ def _camera_rays(camera: Camera, estimator: Estimator) -> Any:
             return ray_through(point, dr.normalize(towards), unit, aspect, start)
 
     return CameraRays()
-
-
-def picture_seconds(estimator: Estimator, camera: Camera, omega_i: NDArray[np.float64], paths: int) -> float:
-    """Seconds to trace so many paths, measured by small pictures of the same view, which grow until one takes
-    half a second."""
-    small, seconds = replace(camera, rows=64, columns=64), 0.0
-    render_reference(estimator, small, omega_i, spp=2)  # compiles
-    for spp in (2, 8, 32, 128, 128):
-        start = time.perf_counter()
-        render_reference(estimator, small, omega_i, spp=spp)
-        seconds = time.perf_counter() - start
-        if seconds > _PILOT_SECONDS:
-            break
-    return seconds * paths / (small.rows * small.columns * spp)
 
 
 def render_reference(
@@ -253,7 +233,7 @@ def render_missing(
     surface: Chart | DisplacedMesh | None = None,
 ) -> list[str]:
     """Render the pictures of :func:`picture_names` that a folder lacks, as EXR images, and record their
-    noise and brightness; returns their names.
+    noise and brightness; returns their names. `advance` is called with pictures done, and parts of them.
 
     Raises
     ------
@@ -277,12 +257,9 @@ def render_missing(
         for (camera, kind), name in missing.items()
     ]
     with open_runner(cluster if missing else None, console.note) as runner:
-        if runner.here and missing and surface is None:
-            paths, estimator = len(missing) * view.size**2 * view.spp, picture_estimator(job)
-            seconds = partial(picture_seconds, estimator, cameras[0], omega_i, paths)
-            size, fibers = len(missing) * _picture_bytes(job, view), job.material.scatters
-            faster = f"--size {max(1, view.size // 2)}, --spp {max(2, view.spp // 4 * 2)}"
-            announce(console, paths, seconds, size, fibers, faster)
+        counts_paths = bool(runner.here and missing) and surface is None
+        if counts_paths:
+            picture_estimator(job).observe = lambda paths: advance(paths / (view.size**2 * view.spp))
         for done in runner.map(render_shape if surface else render_reference, items):
             if done.error:
                 hint = "the same command renders the missing pictures"
@@ -293,7 +270,7 @@ def render_missing(
             relative = noise.value if image.value.any() else 0.0
             facts = {"relative_noise": relative, "brightness": brightness(image.value)}
             folder.keep(done.name, [image.write(folder.path / done.name)], facts)
-            advance(1)
+            advance(0 if counts_paths else 1)
     return list(missing.values())
 
 
@@ -305,24 +282,8 @@ def render_references(
     cluster: str | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Render the missing pictures of a folder, show all at one exposure, and report them.
-
-    Parameters
-    ----------
-    config : the material, the views and the light
-    output : the folder
-    console : where progress and results go
-    cluster : str, optional
-        Workers, as :func:`mbtf_core.run.cluster.open_runner` takes them.
-    overwrite : replace the pictures of another configuration
-
-    Raises
-    ------
-    UsageError : the view shows the horizon, or the camera is inside the surface
-    InputError : the folder holds something else, the surface cannot be displaced, or the pictures do not fit
-        on the disk
-    PartialError : a picture failed; the same command renders the missing ones
-    """
+    """Render the missing pictures of a folder, show all at one exposure, and report them; errors as of
+    :func:`check_view` and :func:`render_missing`, and for a folder that holds something else."""
     wanted, job = config.reference, Job.load(config)
     inputs, surface = dict(job.material.digests), _surface(wanted, job.material.aspect)
     if surface is not None:

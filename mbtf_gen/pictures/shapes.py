@@ -42,19 +42,14 @@ class Chart:
 
     Attributes
     ----------
-    shape : its name
+    name : of the shape
     around : tiles around the axis
     aspect : height of a tile over its width
     """
 
-    shape: Shape
+    name: Shape
     around: int
     aspect: float
-
-    @property
-    def name(self) -> str:
-        """The shape's name."""
-        return self.shape
 
     @property
     def radius(self) -> float:
@@ -64,9 +59,9 @@ class Chart:
     @property
     def along(self) -> tuple[float, float]:
         """Range of y, in tile widths; that of a torus has whole tiles."""
-        if self.shape == "torus":
+        if self.name == "torus":
             return 0.0, max(1, round(self.around / (2.0 * self.aspect))) * self.aspect
-        if self.shape == "cylinder":
+        if self.name == "cylinder":
             return -0.5 * self.around, 0.5 * self.around
         pole = np.arctanh(np.sin(_STEEPEST)) + (np.pi / 2 - _STEEPEST) / np.cos(_STEEPEST)
         return -self.radius * float(pole), self.radius * float(pole)
@@ -75,10 +70,10 @@ class Chart:
         """Positions (..., 3), outward normals (..., 3) and widths of a tile (...) at places of the tiles, all
         lengths in tile widths."""
         azimuth, north = np.broadcast_arrays(x / self.radius, y / self.radius)
-        if self.shape == "cylinder":
+        if self.name == "cylinder":
             n = _around(azimuth, np.ones_like(north), np.zeros_like(north))
             return _around(azimuth, np.full_like(north, self.radius), y + 0.0 * north), n, np.ones_like(north)
-        if self.shape == "sphere":
+        if self.name == "sphere":
             turn = np.arctanh(np.sin(_STEEPEST))
             beyond = np.clip(np.abs(north) - turn, 0.0, None) * np.cos(_STEEPEST)
             latitude = np.arctan(np.sinh(np.clip(north, -turn, turn))) + np.sign(north) * beyond
@@ -106,7 +101,7 @@ class Chart:
         rows, columns = (round(cells * self.aspect), cells) if grid is None else grid.z.shape
         low, high = (round(end / self.aspect * rows) for end in self.along)
         across = self.around * columns
-        check_cells(self.shape, (high - low) * across, columns)
+        check_cells(self.name, (high - low) * across, columns)
         i, j = np.arange(across + 1), np.arange(low, high + 1)
         x, y = (i + 0.5) / columns, ((j + 0.5) / rows) * self.aspect
         p, n, width = self.at(x[None], y[:, None])
@@ -254,11 +249,8 @@ def render_shape(
 
     Parameters
     ----------
-    source : the material and the width of the light
     displaced : the mesh of Mitsuba of heights and a BSDF, such as :meth:`Chart.mesh`
-    camera : looks at the origin
-    omega_i : (3,) float array
-        Unit vector towards the light.
+    camera, omega_i : looks at the origin; unit vector (3,) towards the light
     spp : paths per pixel, both halves together; even
     seed, index : root seed of the random numbers, and number of the picture
     max_depth : longest path in segments; 2 is direct light, -1 has no limit

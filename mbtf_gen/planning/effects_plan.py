@@ -65,18 +65,8 @@ class EffectsPlan:
         effects = [asdict(effect) for effect in self.effects]
         return {**vars(self), "bias_bound": self.bias_bound, "effects": effects}
 
-    def omitted_by(self, larger: EffectsPlan) -> str:
-        """What the plan of a larger run omits beyond this one, in one line; empty where that is nothing."""
-        omitted = [e.description for name, e in EFFECTS.items() if self.on(name) and not larger.on(name)]
-        if larger.max_depth and not self.max_depth:
-            omitted.append(f"what follows {larger.max_depth} surface interactions")
-        if not omitted:
-            return ""
-        bound = f"a bias of at most {percent(larger.bias_bound)}"
-        return f"this run is too small for a pilot; a larger one would omit {', '.join(omitted)}: {bound}"
-
-    def describe(self, note: str = "") -> str:
-        """A table for people, a line or two per effect, and a last line with a note."""
+    def describe(self) -> str:
+        """A table for people, a line or two per effect."""
         before = _NAME + 5 + _BOUND
         lines = [f"{'effect':<{_NAME}}{'':5}{'bias if omitted':<{_BOUND}}reason"]
         for e in self.effects:
@@ -91,17 +81,12 @@ class EffectsPlan:
             lines.append("M has a closed form: no paths are traced")
         elif self.max_depth:
             lines.append(f"paths end after {self.max_depth} surface interactions")
-        lines += [note] * bool(note)
         return "\n".join(lines)
 
 
 def consistent(decided: dict[str, EffectDecision], request: EffectsRequest) -> dict[str, EffectDecision]:
-    """Decisions by name, where effects that need the displaced surface are off without it.
-
-    Raises
-    ------
-    UsageError : the request forces such an effect on
-    """
+    """Decisions by name, where effects that need the displaced surface are off without it; a UsageError if
+    the request forces such an effect on."""
     out = dict(decided)
     if out["parallax"].on:
         return out
@@ -115,12 +100,7 @@ def consistent(decided: dict[str, EffectDecision], request: EffectsRequest) -> d
 
 
 def without(plan: EffectsPlan, name: str) -> EffectsPlan:
-    """The plan without an effect and without those that need it.
-
-    Raises
-    ------
-    UsageError : the material requires the effect
-    """
+    """The plan without an effect and without those that need it; a UsageError if the material requires it."""
     request = EffectsRequest("auto", {name: False})
     decided = consistent({e.name: request.decide(e) for e in plan.effects}, request)
     return replace(plan, effects=tuple(decided.values()))

@@ -87,18 +87,8 @@ class Highlights:
         return np.ones(len(g)) if mean <= 0 else (1.0 - self.share) + self.share * g / mean
 
     def draw(self, plan: QueryPlan, shard: int, rows: int) -> tuple[Queries, F32]:
-        """Sample the test queries of a shard, and their weights.
-
-        Parameters
-        ----------
-        plan : sampler of the run's queries
-        shard, rows : of the test split, as :meth:`~mbtf_gen.sampling.query_sampler.QueryPlan.draw` takes them
-
-        Returns
-        -------
-        Queries, float32 array
-            Weights have the queries' leading axes and, in the mean, the value 1.
-        """
+        """Sample the test queries of a shard, as :meth:`~mbtf_gen.sampling.query_sampler.QueryPlan.draw`, and
+        their weights, which have the queries' leading axes and, in the mean, the value 1."""
         generator = plan.generator("test", shard)
         count = min(CANDIDATES, rows)
         ends = [rows * part // count for part in range(count + 1)]

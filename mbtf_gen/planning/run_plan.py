@@ -95,7 +95,6 @@ def plan_effects(job: Job, *, pilots: bool = True) -> EffectsPlan:
 
     Parameters
     ----------
-    job : configuration and material
     pilots : whether pilots measure where theory gives no bound; otherwise such effects stay on
 
     Raises
@@ -238,13 +237,9 @@ def measured(job: Job, plan: EffectsPlan) -> EffectsPlan:
         if not effect.on or not effect.present:
             return effect
         cut = without(plan, effect.name)
-        removed = [
-            e.description
-            for name, e in EFFECTS.items()
-            if name in plan.names_on - cut.names_on - {effect.name}
-        ]
-        listed = " and ".join([", ".join(removed[:-1]), *removed[-1:]]).removeprefix(" and ")
-        text = f"; the bound includes {listed}" if removed else ""
+        others = plan.names_on - cut.names_on - {effect.name}
+        removed = ", ".join(e.description for name, e in EFFECTS.items() if name in others)
+        text = f"; the bound includes {removed}" if removed else ""
         change = pilot.changed(cut)
         upper = change.upper if change.changed >= FEW else change.bound()
         return replace(

@@ -57,12 +57,7 @@ class EffectsRequest:
     @classmethod
     def parse(cls, text: str, names: Collection[str]) -> EffectsRequest:
         """Read ``auto``, ``all``, ``none``, ``+x``, ``-x``, or a comma-separated list of them; `names` are
-        those of all effects.
-
-        Raises
-        ------
-        UsageError : an unknown word
-        """
+        those of all effects. A UsageError names an unknown word."""
         base: Any = "auto"
         forced: dict[str, bool] = {}
         for position, word in enumerate(w.strip() for w in text.split(",")):
@@ -79,12 +74,8 @@ class EffectsRequest:
         return cls(base, forced)
 
     def decide(self, effect: EffectDecision) -> EffectDecision:
-        """The effect, switched where the user requests it.
-
-        Raises
-        ------
-        UsageError : the request switches an effect on that the material lacks, or off one that it requires
-        """
+        """The effect, switched where the user requests it; a UsageError if the request switches an effect on
+        that the material lacks, or off one that it requires."""
         name = effect.name
         if not effect.present:
             requested = self.forced.get(name, effect.on)

@@ -44,7 +44,6 @@ def build_estimator(
 
     Parameters
     ----------
-    job, plan : configuration and material, and the effects to simulate
     tiles : tiles of this job built so far, by the effects that change them; plans that share a dictionary
         share their tiles
     variant : of Mitsuba, which sets the device; one per process

@@ -21,14 +21,9 @@ from mbtf_gen.measured.exported import mean_of
 
 F64 = NDArray[np.float64]
 PICTURE_NAME = "contact_sheet.png"
-# Panels of the tile: whether they take grazing lights from the left alone.
-_PANELS = {"all lights": False, "light from the left": True}
-# Exponent of luminance under grazing light, whose smoothing leaves little contrast.
-_CONTRAST = 1.6
-# Highest elevation of grazing lights, and elevations of the lights of the BRDF, in degrees. The lowest
-# lights have the most contrast, and the more there are, the narrower is the smoothing.
-_GRAZING, _ELEVATIONS = 45.0, (35.0, 65.0)
-# Smallest cosine of views in panels of the tile; without heights, parallax blurs them.
+# Elevations of the lights of the BRDF, in degrees.
+_ELEVATIONS = (35.0, 65.0)
+# Smallest cosine of views in the picture of the tile; without heights, parallax blurs it.
 _WITH_HEIGHTS, _FROM_ABOVE = 0.35, 0.85
 # Pixels across a panel, queries that its smoothing averages, its largest standard deviation in tile widths.
 _ACROSS, _PER_WINDOW, _WIDEST = 192, 32, 0.1
@@ -51,28 +46,20 @@ def mean_image(x: F64, y: F64, value: F64, rows: int, columns: int) -> F64:
     return np.moveaxis(np.asarray(found), 0, -1)
 
 
-def tile_images(arrays: Arrays, aspect: float, geometry: Geometry | None) -> dict[str, F64]:
-    """Mean value by visible position, under some lights.
+def tile_image(arrays: Arrays, aspect: float, geometry: Geometry | None) -> F64:
+    """Mean value by visible position, under all lights.
 
-    Images (rows, columns, 3) in 1/sr by title, row 0 at ``v → 1``, of a tile of this height over its width.
-    They are smoothed as wide as few queries require; NaN where there are none. Values over white and over
-    99% of the others are clipped: a highlight that few queries see would be a speck.
+    An image (rows, columns, 3) in 1/sr, row 0 at ``v → 1``, of a tile of this height over its width, smoothed
+    as wide as few queries require; NaN where there are none. Values over white and over 99% of the others are
+    clipped: a highlight that few queries see would be a speck.
     """
-    u, light, view, value = _queries(arrays)
+    u, _, view, value = _queries(arrays)
     value = np.minimum(value, max(2.0**-ALBEDO_EXPOSURE, np.quantile(value, 0.99, axis=0).max()))
     sigma = np.asarray(arrays["sigma"], np.float64).reshape(-1)
-    if geometry is None:
-        known = view[:, 2] > _FROM_ABOVE
-    else:
-        known = view[:, 2] > _WITH_HEIGHTS
-        u[known] = visible_positions(u[known], view[known], geometry)
-    grazing = light[:, 2] <= np.sin(np.radians(_GRAZING))
-    out = {}
-    for title, grazes in _PANELS.items():
-        from_left = -light[:, 0] >= 0.5 * np.hypot(*light[:, :2].T)
-        found = known & grazing & from_left if grazes else known
-        out[title] = _smoothed(u[found], sigma[found], value[found], aspect)
-    return out
+    found = view[:, 2] > (_FROM_ABOVE if geometry is None else _WITH_HEIGHTS)
+    if geometry is not None:
+        u[found] = visible_positions(u[found], view[found], geometry)
+    return _smoothed(u[found], sigma[found], value[found], aspect)
 
 
 def visible_positions(u: F64, view: F64, geometry: Geometry) -> F64:
@@ -138,17 +125,6 @@ def _queries(arrays: Arrays) -> tuple[F64, F64, F64, F64]:
     return u.reshape(-1, 2), light.reshape(-1, 3), view.reshape(-1, 3), value
 
 
-def contrasted(image: F64) -> F64:
-    """An image (..., 3) of larger ratios of luminance, and of the same colors and geometric mean."""
-    bright = image.mean(axis=-1, keepdims=True)
-    lit = bright > 0
-    if not lit.any():
-        return image
-    level = np.exp(np.log(bright[lit]).mean())
-    factor = np.divide(bright, level, out=np.ones_like(bright), where=lit) ** (_CONTRAST - 1.0)
-    return np.asarray(image * factor)
-
-
 def displayed(image: F64) -> NDArray[np.uint8]:
     """8-bit sRGB of an image (..., 3) that keeps albedos; pixels without queries are light gray."""
     known = np.asarray(np.isfinite(image).all(axis=-1))
@@ -161,12 +137,10 @@ def write_picture(arrays: Arrays, aspect: float, geometry: Geometry | None, path
     """Write the contact sheet of training queries and of a geometry as a PNG, atomically."""
     from matplotlib.figure import Figure
 
-    panels = []
-    for title, image in tile_images(arrays, aspect, geometry).items():
-        if _PANELS[title]:
-            title, image = f"{title}, contrasted", contrasted(image)
-        panels.append((title, image, (0, 1, 0, aspect)))
-    panels.append(("apparent BRDF by ω_o", brdf_image(arrays), (-1, 1, -1, 1)))
+    panels = [
+        ("the tile, all lights", tile_image(arrays, aspect, geometry), (0, 1, 0, aspect)),
+        ("apparent BRDF by ω_o", brdf_image(arrays), (-1, 1, -1, 1)),
+    ]
     figure = Figure(figsize=(3.0 * (len(panels) + (geometry is not None)), 3.3), layout="constrained")
     axes: Any = figure.subplots(1, len(panels) + (geometry is not None))
     for at, (title, image, extent) in zip(axes, panels, strict=False):

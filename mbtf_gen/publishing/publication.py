@@ -71,8 +71,6 @@ class Publication:
 
         Parameters
         ----------
-        shards : folder of shards
-        config : what its publishers say
         with_maps : publish the input files of the material
         material : path of the material, if it was moved
 
@@ -154,18 +152,8 @@ class Publication:
     def write(
         self, output: Path, *, overwrite: bool = False, progress: Callable[[float], None] = lambda _: None
     ) -> dict[str, Stored]:
-        """Write the folder, or finish an unfinished one; every shard is read once.
-
-        Parameters
-        ----------
-        output : folder to write
-        overwrite : replace what was published there
-        progress : called with 1 after each shard
-
-        Returns
-        -------
-        dict of str to Stored
-            The files by name.
+        """Write the folder, or finish an unfinished one; returns its files by name. Every shard is read once,
+        and `progress` is called with 1 after it.
 
         Raises
         ------

@@ -58,18 +58,12 @@ def is_yaml_alone(data: Dataset) -> bool:
 
 
 def recipe_files(data: Dataset, *, with_maps: bool, moved: Path | None) -> dict[str, Content]:
-    """Configuration, digests and material of a recipe, by name in the published folder.
+    """Configuration, digests and, `with_maps`, material of generated data, by name in the published folder;
+    an InputError if the material cannot be read, has changed since, or consists of files that cannot be
+    copied.
 
-    Parameters
-    ----------
-    data : generated, not measured
-    with_maps : whether the input files of the material are published; a weave or a knit is in any case, where
-        its YAML is unchanged
-    moved : path of the material, if it is not where the data set was generated from
-
-    Raises
-    ------
-    InputError : the material cannot be read, has changed since, or consists of files that cannot be copied
+    A weave or a knit is published in any case, where its YAML is unchanged. The material is at `moved`, if it
+    is not where the data set was generated from.
     """
     config = public_config(data.manifest)
     shards = [shard for split in data.splits for shard in data.shards(split)]

@@ -110,11 +110,6 @@ class Estimator:
         lights : L queries i, i + n/L, i + 2n/L, … are a group with one position, footprint and view, whose
             lights share the group's paths
 
-        Returns
-        -------
-        Estimates
-            Values of both halves in 1/sr, with counts of lost and non-finite samples.
-
         Raises
         ------
         ValueError : a number of paths is odd or zero, or the queries are not whole groups

@@ -195,11 +195,6 @@ class PathTracer:
         again are compacted and continue in a second kernel; otherwise most lanes would idle beside a few long
         paths.
 
-        Parameters
-        ----------
-        ray : first rays, in scene units
-        rng : random numbers, one sequence per lane
-
         Returns
         -------
         Path

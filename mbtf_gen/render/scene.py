@@ -45,16 +45,8 @@ CLEARANCE = 0.01
 
 
 def ray_through(point: Point2f, omega_o: Vector3f, unit: Float, aspect: Float, start: Float) -> Ray3f:
-    """Ray against ω_o that intersects the reference plane at uv `point`, wrapped into the tile.
-
-    Parameters
-    ----------
-    point : position on the reference plane, uv
-    omega_o : direction towards the viewer
-    unit : scene units per tile width
-    aspect : H/W of the tile
-    start : height above the reference plane at which the ray starts, in scene units
-    """
+    """Ray against ω_o that intersects the reference plane at uv `point`, wrapped into the tile; `unit` scene
+    units per tile width, from the height `start` above the plane, in scene units."""
     wrapped = point - dr.floor(point)
     plane = mi.Point3f((wrapped.x - 0.5) * unit, (wrapped.y - 0.5) * (unit * aspect), 0.0)
     return mi.Ray3f(dr.fma(omega_o, start / omega_o.z, plane), -omega_o)
@@ -159,18 +151,8 @@ def unit_of(aspect: float) -> float:
 def build_scene(
     shape: Tile | HeightGrid, bsdf: Mapping[str, Any] | BSDF | Sequence[Mapping[str, Any]]
 ) -> TileScene:
-    """Build the scene of a tile.
-
-    Parameters
-    ----------
-    shape : the shape, in tile widths
-    bsdf : mapping, mitsuba.BSDF or sequence of mapping; a Mitsuba dictionary, or a loaded BSDF; one
-        dictionary per part of a mesh or kind of yarn
-
-    Raises
-    ------
-    InputError : Mitsuba rejects the BSDF
-    """
+    """Build the scene of a tile, from a Mitsuba dictionary or a loaded BSDF, or from one dictionary per part
+    of a mesh or kind of yarn; an InputError if Mitsuba rejects the BSDF."""
     surface, unit = load_surface(bsdf), unit_of(shape.aspect)
     return TileScene(shape.aspect, unit, shape.trace(unit, surface.transmits), surface)
 

@@ -61,13 +61,6 @@ class LevelMixture:
         rest = (xi - self.log_uniform) / self.finest if self.finest > 0 else xi
         return np.where(first, share * finest, low + rest * (finest - low))
 
-    def density(self, level: NDArray[np.float64], finest: int) -> NDArray[np.float64]:
-        """Probability density at fractional levels, for the finest level k ≥ 1; 0 outside [0, k]."""
-        low = max(finest - 1, 0)
-        inside = (level >= 0) & (level <= finest)
-        near = np.where(inside & (level >= low), self.finest / (finest - low), 0.0)
-        return np.where(inside, self.log_uniform / finest, 0.0) + near
-
 
 def _rounded(u: NDArray[np.float64], v: NDArray[np.float64]) -> F32:
     """Positions (..., 2) in [0, 1)."""

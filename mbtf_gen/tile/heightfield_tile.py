@@ -345,10 +345,10 @@ class HeightFieldTile(Tile):
         path, extent = self.files["height"], float(np.ptp(self.height))
         if extent == 0:
             return None
-        if "normal" in self.files:
-            used = self.height_scale, self._median_slope
-            if text := suggestion_warning(self.files["normal"], self.normal_fit, *used):
-                return text
+        if "normal" in self.files and (
+            text := suggestion_warning(self.files["normal"], self.normal_fit, self.height_scale)
+        ):
+            return text
         extent *= abs(self.height_scale)
         if self.height_from == "default" and extent > _STEEP and self.unit_fault() is None:
             return f"{path}: the displacement range is {extent:.4g} tile widths; check --height-scale"

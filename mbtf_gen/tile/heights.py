@@ -66,13 +66,8 @@ class HeightGrid:
         return a + (b - a) * x + (c - a) * y + (d - b - c + a) * np.maximum(0.0, x + y - 1.0)
 
     def trace(self, unit: float, below: bool = False) -> TileGeometry:
-        """The surface as rays meet it, see :meth:`mbtf_gen.tile.protocol.Tile.trace`.
-
-        Raises
-        ------
-        InputError
-            Mitsuba would trace too many triangles.
-        """
+        """The surface as rays meet it, see :meth:`mbtf_gen.tile.protocol.Tile.trace`; an InputError if
+        Mitsuba would trace too many triangles."""
         if self.tracer == "heightfield":
             from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
@@ -136,22 +131,15 @@ def carried_share(normal: NDArray[np.float64], heights: NDArray[np.float64]) -> 
 def residual_slopes(
     normal: NDArray[np.float32], grid: HeightGrid, mode: NormalMode = "residual"
 ) -> tuple[NDArray[np.float64], float]:
-    """Slopes to add to the mesh's own, and the share c of the mesh's slopes that the map repeats.
+    """Slopes (h, w, 2) to add to the mesh's own at the texels of a map, and the share c ≥ 0 of the mesh's
+    slopes that the map repeats.
 
     Parameters
     ----------
     normal : (h, w, 3), unit vectors, y along v
-    grid : heights of the mesh
-    mode : {"residual", "absolute", "off"}, ``residual``: slopes of the map less ``min(c, 1)`` times those of
-        the mesh, so that slopes of both count once and displacement beyond the map's stays. ``absolute``: the
-        map's slopes in place of the mesh's.
-
-    Returns
-    -------
-    slopes : (h, w, 2) float64 array
-        Slopes at the texels of the map.
-    share : float
-        c ≥ 0.
+    mode : ``residual``: slopes of the map less ``min(c, 1)`` times those of the mesh, so that slopes of both
+        count once and displacement beyond the map's stays. ``absolute``: the map's slopes in place of the
+        mesh's.
     """
     rows, columns = normal.shape[:2]
     stated = normal_slopes(normal)

@@ -66,9 +66,6 @@ def inspection_text(found: Mapping[str, Any], name: str) -> str:
     if written := found.get("written"):
         stored = (f"{name} {c['value']} ({c['reason']})" for name, c in written["choices"].items())
         lines += ["", *_wrapped("written    ", f"{written['file']}: {', '.join(stored)}")]
-    if exported := found.get("exported"):
-        rows, columns = found["geometry"]["mesh"]
-        lines.append(f"exported   {exported}: {columns} x {rows} heights z in tile widths")
     # The most important one comes last.
     scale, others = found["scale_warning"], [w for w in found["warnings"] if w != found["scale_warning"]]
     for title, texts in (("warnings", brief_warnings(others)), ("remarks", found["oddities"])):

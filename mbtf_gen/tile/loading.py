@@ -78,20 +78,7 @@ def load_material(path: str | Path, tiling: Tiling | None = None, max_pixels: in
 
 def latest_material(path: str | Path, tiling: Tiling | None = None, max_pixels: int = MAX_PIXELS) -> Tile:
     """:func:`load_material`; maps are not decoded again while the contents of folder and files are the same.
-
-    Parameters
-    ----------
-    path, tiling, max_pixels : as for ``load_material``
-
-    Returns
-    -------
-    Tile
-        Not to be changed: the next call may return it again.
-
-    Raises
-    ------
-    InputError : as ``load_material``
-    """
+    The tile is not to be changed: the next call may return it again."""
     global _kept
     spec, folder, found = described(Path(path))
     method = spec.tiling(tiling)
@@ -122,21 +109,8 @@ def _load(spec: Described, folder: Path, found: FoundMaps, tiling: Tiling, max_p
 
 
 def described(path: Path) -> tuple[Described, Path, FoundMaps]:
-    """Material file of what :func:`load_material` loads.
-
-    Parameters
-    ----------
-    path : as for :func:`load_material`
-
-    Returns
-    -------
-    (MaterialFile, ClothFile or MeshFile, Path, FoundMaps)
-        The file, the folder that its file names are relative to, and the maps found there.
-
-    Raises
-    ------
-    InputError : nothing usable is at the path
-    """
+    """Material file of what :func:`load_material` loads, the folder that its file names are relative to, and
+    the maps found there; an InputError if nothing usable is at the path."""
     path = named_file(Path(), str(path))
     if path.is_dir():
         described = next((path / name for name in _YAML if os.path.lexists(path / name)), None)

@@ -63,17 +63,7 @@ class MeshFile(Settings):
 
 
 def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
-    """The tile of a mesh.
-
-    Parameters
-    ----------
-    spec : what to read
-    folder : folder that its file name is relative to
-
-    Raises
-    ------
-    InputError : the file cannot be read, or its triangles are no tile
-    """
+    """The tile of a mesh; an InputError if the file cannot be read, or its triangles are no tile."""
     path = named_file(folder, spec.mesh)
     content = read_mesh_content(path)
     shapes = [_shape(shape, spec, path) for shape in content.shapes]
@@ -216,11 +206,8 @@ def with_vertex_colors(shape: MeshShape) -> MeshShape:
     """A shape whose base color includes the colors of its vertices.
 
     Colors that are all equal become a factor. Others become a texture of 2 x 2 texels per triangle: bilinear
-    interpolation between the centers of three of them is linear, if the fourth continues their plane.
-
-    Raises
-    ------
-    InputError : the shape has textures as well
+    interpolation between the centers of three of them is linear, if the fourth continues their plane. A shape
+    that has textures as well is refused.
     """
     if shape.colors is None:
         return shape

@@ -127,23 +127,14 @@ def far_off(factor: float, suggested: float) -> bool:
     return suggested != 0 and not 1 / _FAR_OFF <= factor / suggested <= _FAR_OFF
 
 
-def suggestion_warning(path: Path, fit: NormalFit | None, factor: float, median: float) -> str | None:
-    """The warning that the height scale in use is over 1.5 times, or under 1/1.5 of, the one that the normal
-    map suggests; `median` is the median slope in use, in degrees."""
-    if fit is None or not fit.fits or fit.scale == 0:
-        return None
-    if not far_off(factor, fit.scale):
+def suggestion_warning(path: Path, fit: NormalFit | None, factor: float) -> str | None:
+    """The warning that the height scale in use is far off the one that the normal map suggests."""
+    if fit is None or not fit.fits or not far_off(factor, fit.scale):
         return None
     ratio = factor / fit.scale
-    choice = ""
-    if ratio:
-        # Tangents of slopes are proportional to the scale.
-        agreed = math.degrees(math.atan(math.tan(math.radians(median)) / abs(ratio)))
-        choice = f" (median slope {agreed:.1f}°, now {median:.1f}°)"
-        choice += "; keep it to exaggerate" if ratio > 1 else ""
     return (
         f"{path}: the heights are {ratio:{'.0f' if abs(ratio) >= 10 else '.2g'}} times as steep as its "
-        f"slopes ({factor:.3g} is in use); add --height-scale {fit.scale:.3g} to agree{choice}"
+        f"slopes ({factor:.3g} is in use); add --height-scale {fit.scale:.3g} to agree"
     )
 
 

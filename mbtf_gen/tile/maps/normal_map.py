@@ -111,19 +111,9 @@ def slopes_of_normals(normal: Array) -> Array:
 
 
 def fit_normals(height: Array, normal: Array) -> NormalFit | None:
-    """Compare a normal map with the heights of the same tile.
-
-    Parameters
-    ----------
-    height : (H, W), stored heights
-    normal : (h, w, 3), unit vectors, y along v (OpenGL). Both maps are box-filtered to the coarser
-        resolution.
-
-    Returns
-    -------
-    NormalFit or None
-        None if heights or normals are flat, or have fewer than 4 texels along a side.
-    """
+    """Compare a normal map (h, w, 3), unit vectors with y along v, with the stored heights (H, W) of the same
+    tile, both box-filtered to the coarser resolution. None if either is flat, or has fewer than 4 texels
+    along a side."""
     fitted = _common(height, normal, _FITTED)
     if min(fitted[0].shape) < _SMALLEST:
         return None
@@ -197,20 +187,11 @@ def _guesses(height: Array, normal: Array) -> list[tuple[float, Turned, str]]:
 
 
 def stored_xy(vectors: Array) -> tuple[list[int], str] | None:
-    """The channels of x and y in a normal map that stores no z, and the same in words.
+    """The channels of x and y in a normal map (H, W, C) that stores no z, and the same in words; None where
+    the map stores z. Components are in [-1, 1]; of large maps, some decide.
 
     Blue is no z where it neither equals √(1 - x² - y²) nor varies with it. In such maps x is in alpha if red
     and blue are constant or equal green, and alpha is not constant.
-
-    Parameters
-    ----------
-    vectors : (H, W, C), components of the normals in [-1, 1], C = 2: x and y; 3: RGB; 4: RGBA. Of large maps,
-        some decide.
-
-    Returns
-    -------
-    (list of int, str) or None
-        None where the map stores z.
     """
     if vectors.shape[2] == 2:
         return [0, 1], "x and y"

@@ -163,15 +163,9 @@ def blend_maps(maps: Mapping[str, Any]) -> dict[str, Any]:
 
     Parameters
     ----------
-    maps : mapping of str to array, float or None
-        (H, W) or (H, W, C) by role, of any resolutions. ``height`` keeps its mean and variance, ``normal``
+    maps : (H, W) or (H, W, C) by role, of any resolutions. ``height`` keeps its mean and variance, ``normal``
         (unit vectors, x along u and y along v) those of its slopes, all others their histograms. Normals do
         not contain the slope that the weights themselves give the heights: the mesh has it.
-
-    Returns
-    -------
-    dict of str to array, float or None
-        Maps of the same shapes and types.
     """
     images = {role: np.asarray(value) for role, value in maps.items() if np.ndim(value) >= 2}
     layers = {role: _layer(role, image) for role, image in images.items()}

@@ -165,37 +165,26 @@ def test_roughness_outside_its_range_is_clipped(name: str) -> None:
         np.testing.assert_allclose(a, b, rtol=1e-6)
 
 
-@pytest.mark.parametrize("roughness", [0.0, 0.3])
-def test_black_is_black(roughness: float) -> None:
-    omega_o = towards(np.array([0.9, 0.1, 1e-3]), 180.0)
-    for given in ({"metallic": 1.0}, {"specular": 0.0}):
-        got = values(surface(0.0, roughness=roughness, **given), LightKernel(5.0), mirrored(omega_o), omega_o)
-        assert np.all(got == 0)
-
-
 # Every parameter as a map, so that all cases share their kernels.
 NUMBERS = {"roughness": 0.3, "metallic": 0.5, "specular": 0.5, "clearcoat": 0.5, "clearcoat_roughness": 0.2}
 NUMBERS |= {"sheen": 0.5, "sheen_roughness": 0.3}
 MAPS = {name: np.full((2, 2), value) for name, value in NUMBERS.items()}
 MAPS |= {name: np.full((2, 2, 3), 0.5) for name in ("base_color", "sheen_color")}
 MAPS["slopes"] = np.zeros((2, 2, 3))
+LIGHTS = (LightKernel(1.0), None)
 
 
-# Every map under one light, and one map under every light.
+# Every map under one light, one map under every light, and the maps of a Lambert surface.
 @pytest.mark.parametrize(
-    ("name", "light"),
-    [*((name, LightKernel(1.0)) for name in MAPS), ("roughness", LightKernel(0.0)), ("roughness", None)],
+    ("name", "light", "roles"),
+    [
+        *((name, LightKernel(1.0), list(MAPS)) for name in MAPS),
+        *(("roughness", light, list(MAPS)) for light in (LightKernel(0.0), None)),
+        *((n, light, ["base_color", "slopes"]) for n in ("base_color", "slopes") for light in LIGHTS),
+    ],
 )
-def test_nan_in_a_map_is_reported_never_black(name: str, light: LightKernel | None) -> None:
-    maps = {n: bitmap(m * (np.nan if n == name else 1.0)) for n, m in MAPS.items()}
-    with pytest.raises(PartialError, match="NaN or infinite"):
-        values({"type": "mbtf_surface", **maps}, light, direction(50, 0), direction(60, 90))
-
-
-@pytest.mark.parametrize("light", [LightKernel(1.0), None], ids=["lobe", "furnace"])
-@pytest.mark.parametrize("name", ["base_color", "slopes"])
-def test_nan_of_a_lambert_surface_is_reported(name: str, light: LightKernel | None) -> None:
-    maps = {n: bitmap(MAPS[n] * (np.nan if n == name else 1.0)) for n in ("base_color", "slopes")}
+def test_nan_in_a_map_is_reported_never_black(name: str, light: LightKernel | None, roles: list[str]) -> None:
+    maps = {role: bitmap(MAPS[role] * (np.nan if role == name else 1.0)) for role in roles}
     with pytest.raises(PartialError, match="NaN or infinite"):
         values({"type": "mbtf_surface", **maps}, light, direction(50, 0), direction(60, 90))
 

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support import jobs
 from support.height_maps import slope_normals
+from support.jobs import height_field
 
-from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.planning import run_plan
 from mbtf_gen.planning.bounds import Change, displacement_bounds
@@ -34,17 +36,8 @@ def waves(rows: int, columns: int) -> NDArray[np.float64]:
     return (h - h.min()) / np.ptp(h)
 
 
-def job_of(stuff: HeightFieldTile, mode: str = "auto", **options: dict[str, Any]) -> Job:
-    sections: dict[str, Any] = {"queries": {"min_cos": 0.4}, "transport": {"max_depth": 1}, **options}
-    effects = {"mode": mode, **sections.pop("effects", {})}
-    return Job.of(GeneratorConfig.model_validate({"material": "m", "effects": effects, **sections}), stuff)
-
-
-COLOR = np.array([0.7, 0.5, 0.2])
-
-
-def lambert(height: NDArray[np.float64], scale: float, **more: Any) -> HeightFieldTile:
-    return HeightFieldTile(height=height, height_scale=scale).with_maps(base_color=COLOR, **more)
+job_of = partial(jobs.job_of, queries={"min_cos": 0.4}, transport={"max_depth": 1})
+lambert = partial(height_field, color=(0.7, 0.5, 0.2))
 
 
 def estimates(job: Job, plan: EffectsPlan, spp: int = 8) -> Estimates:

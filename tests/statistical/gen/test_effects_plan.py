@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support import jobs
 from support.height_maps import slope_normals
+from support.jobs import height_field
 from support.scenes import rocks
 
 from mbtf_core.stats import Estimate, mean_of_halves
-from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.planning.bounds import Change
 from mbtf_gen.planning.effects_plan import EffectsPlan, without
@@ -40,17 +41,12 @@ def bumps(strength: float) -> NDArray[np.float32]:
 ROCKS = rocks(64, 1.0).z
 
 
-def material(relief: float, albedo: Any = 0.5, **more: Any) -> HeightFieldTile:
-    color = np.full(3, albedo) if np.ndim(albedo) == 0 else albedo
-    return HeightFieldTile(height=ROCKS, height_scale=relief, maps={"base_color": color, **more})
+material = partial(height_field, ROCKS)
 
 
-def job_of(
-    stuff: HeightFieldTile, mode: str = "auto", min_cos: float = 0.1, width: float = 1.0, depth: int = 0
-) -> Job:
-    sections = {"effects": {"mode": mode}, "light": {"width": width}, "transport": {"max_depth": depth}}
-    sections["queries"] = {"min_cos": min_cos, "resolution": 64}
-    return Job.of(GeneratorConfig.model_validate({"material": "m", **sections}), stuff)
+def job_of(stuff: HeightFieldTile, mode: str = "auto", min_cos: float = 0.1, width: float = 1.0) -> Job:
+    queries = {"min_cos": min_cos, "resolution": 64}
+    return jobs.job_of(stuff, mode, queries=queries, light={"width": width}, transport={"max_depth": 0})
 
 
 def estimates(job: Job, plan: EffectsPlan, seed: int = 1) -> Estimates:

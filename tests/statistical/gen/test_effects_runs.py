@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.formula_runs import Formula
+from support.jobs import height_field, job_of
 
 from mbtf_core.data.schema import Queries
 from mbtf_core.files.atomic import write_checksummed
@@ -18,12 +19,10 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation import run as generation
 from mbtf_gen.generation.run import generate
-from mbtf_gen.job import Job
 from mbtf_gen.planning.effects_plan import EffectsPlan, without
 from mbtf_gen.planning.run_plan import plan_effects
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Stream
-from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 
 load_mitsuba()
 
@@ -37,18 +36,6 @@ def noise(rows: int, columns: int) -> NDArray[np.float64]:
     return (h - h.min()) / np.ptp(h)
 
 
-def lambert(
-    height: NDArray[np.float64], scale: float, color: Any = (0.5, 0.5, 0.5), **more: Any
-) -> HeightFieldTile:
-    base = np.asarray(color, np.float64)
-    return HeightFieldTile(height=height, height_scale=scale, maps={"base_color": base, **more})
-
-
-def job_of(stuff: HeightFieldTile, mode: str = "auto", **options: Any) -> Job:
-    data = {"material": "m", "effects": {"mode": mode}, **options}
-    return Job.of(GeneratorConfig.model_validate(data), stuff)
-
-
 OPACITY = np.where(np.random.default_rng(2).random((8, 8)) < 0.4, 0.2, 1.0)
 
 
@@ -56,7 +43,7 @@ OPACITY = np.where(np.random.default_rng(2).random((8, 8)) < 0.4, 0.2, 1.0)
     "mode", ["all", "all,-interreflection,-bsdf_sampling", "none,+opacity", "all,-opacity,-shadowing"]
 )
 def test_values_do_not_depend_on_launches_whatever_is_simulated(mode: str) -> None:
-    job = job_of(lambert(noise(16, 16), 0.05, opacity=OPACITY), mode)
+    job = job_of(height_field(noise(16, 16), 0.05, opacity=OPACITY), mode)
     estimator = build_estimator(job, plan_effects(job))
     q = pilot_queries(job, 500)
     whole = estimator.estimate(q, 8, STREAM)
@@ -74,7 +61,7 @@ def test_values_do_not_depend_on_launches_whatever_is_simulated(mode: str) -> No
 
 def test_the_closed_form_is_the_color_over_pi() -> None:
     color = np.array([0.8, 0.3, 0.1])
-    job = job_of(lambert(np.zeros((4, 4)), 1.0, color), light={"width": 0.0})
+    job = job_of(height_field(np.zeros((4, 4)), 1.0, color), light={"width": 0.0})
     plan = plan_effects(job)
     assert plan.closed_form
     q = pilot_queries(job, 50)
@@ -114,7 +101,7 @@ def test_resumed_and_sliced_runs_follow_the_plan_of_the_manifest(
 
 def test_what_passed_is_the_view_rays_alone() -> None:
     """Scattered rays that leave through holes do not count as transmittance."""
-    job = job_of(lambert(noise(16, 16), 0.15, (0.9, 0.9, 0.9), opacity=OPACITY), "all,-bsdf_sampling")
+    job = job_of(height_field(noise(16, 16), 0.15, (0.9, 0.9, 0.9), opacity=OPACITY), "all,-bsdf_sampling")
     plan = plan_effects(job)
     q = pilot_queries(job, 2000)
     full, direct = (
@@ -127,7 +114,7 @@ def test_what_passed_is_the_view_rays_alone() -> None:
 @pytest.mark.parametrize("depth", [2, 3])
 def test_a_cap_is_the_same_with_and_without_sampling_of_the_surface(depth: int) -> None:
     """BSDF samples cannot hit a delta light, so only the cap affects the values."""
-    stuff = lambert(noise(16, 16), 0.3, (0.9, 0.9, 0.9))
+    stuff = height_field(noise(16, 16), 0.3, (0.9, 0.9, 0.9))
     options: dict[str, Any] = {"light": {"width": 0.0}, "queries": {"min_cos": 0.4}}
     means = []
     for mode, limit in (("all", depth), ("all,-bsdf_sampling", depth), ("all,-bsdf_sampling", depth - 1)):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
+from support.jobs import job_of
 from support.mitsuba_shapes import tile_mesh
 from support.scenes import (
     Estimator,
@@ -25,8 +26,6 @@ from support.scenes import (
 )
 
 from mbtf_core.stats import mean_of_halves
-from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import plan_effects, reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.tile.loading import load_material
@@ -52,10 +51,6 @@ def tile_of(plates: list[NDArray[np.float64]], colors: list[float], aspect: floa
         np.repeat(np.arange(len(plates)), 2),
         [MeshPart(str(k), {"base_color": np.full(3, c)}) for k, c in enumerate(colors)],
     )
-
-
-def job_of(tile: MeshTile, mode: str) -> Job:
-    return Job.of(GeneratorConfig.model_validate({"material": "m", "effects": {"mode": mode}}), tile)
 
 
 def traced(tile: MeshTile, light: LightKernel | None, q: Any, spp: int = 16) -> Any:

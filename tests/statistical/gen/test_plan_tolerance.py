@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.height_maps import fractal, slope_normals
+from support.jobs import height_field, job_of
 from support.paths import ROOT
 
-from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job
 from mbtf_gen.planning.bounds import Change
 from mbtf_gen.planning.run_plan import plan_effects, reference_plan
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
@@ -20,16 +19,6 @@ from mbtf_gen.render.estimates import Stream
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.heights import HeightGrid, height_slopes, residual_slopes
 from mbtf_gen.tile.loading import load_material
-
-
-def stuff(height: NDArray[np.float64], scale: float, color: Any = 0.5, **more: Any) -> HeightFieldTile:
-    base = np.full(3, color) if np.ndim(color) == 0 else np.asarray(color)
-    return HeightFieldTile(height=height, height_scale=scale, maps={"base_color": base, **more})
-
-
-def job_of(material: HeightFieldTile, mode: str = "auto", **options: Any) -> Job:
-    effects = {"mode": mode, **options.pop("effects", {})}
-    return Job.of(GeneratorConfig.model_validate({"material": "m", "effects": effects, **options}), material)
 
 
 def ripples(strength: float) -> NDArray[np.float64]:
@@ -42,26 +31,30 @@ def scratches() -> HeightFieldTile:
     """Grooves one vertex wide, which a grid thinned by two does not have."""
     h = np.zeros((512, 512))
     h[:, 1::32] = -1
-    return stuff(h, 0.004, 0.3)
+    return height_field(h, 0.004, 0.3)
 
 
 def checks() -> HeightFieldTile:
     """Red and green of equal luminance on a faint displacement."""
     red = np.random.default_rng(4).random((256, 256)) < 0.5
-    return stuff(fractal(64, 64, 3.0), 4e-4, np.where(red[..., None], [0.8, 0.1, 0.1], [0.1, 0.8, 0.1]))
+    return height_field(
+        fractal(64, 64, 3.0), 4e-4, np.where(red[..., None], [0.8, 0.1, 0.1], [0.1, 0.8, 0.1])
+    )
 
 
 def bright_veil() -> HeightFieldTile:
     """Bright texels transmit a little light."""
     opacity, base = np.ones((64, 64)), np.full((64, 64, 3), 0.005)
     opacity[:, :2], base[:, :2] = 254 / 255, 0.9
-    return stuff(np.zeros((4, 4)), 1.0, base, opacity=opacity)
+    return height_field(np.zeros((4, 4)), 1.0, base, opacity=opacity)
 
 
 SCENES: dict[str, tuple[HeightFieldTile, dict[str, Any], int]] = {
     # Bounds for Lambert do not hold under a clearcoat: the error was 0.4 with them.
     "clearcoat": (
-        stuff(fractal(64, 64, 3.0), 2e-5, normal=ripples(0.003), clearcoat=1.0, clearcoat_roughness=0.1),
+        height_field(
+            fractal(64, 64, 3.0), 2e-5, normal=ripples(0.003), clearcoat=1.0, clearcoat_roughness=0.1
+        ),
         {},
         16,
     ),
@@ -69,7 +62,7 @@ SCENES: dict[str, tuple[HeightFieldTile, dict[str, Any], int]] = {
     "scratches": (scratches(), {}, 8),
     "colors of one brightness": (checks(), {"queries": {"resolution": 256}}, 8),
     "wide light from above": (
-        stuff(fractal(64, 64, 1.6), 0.2, 0.05),
+        height_field(fractal(64, 64, 1.6), 0.2, 0.05),
         {"queries": {"min_cos": 0.98, "resolution": 64}, "light": {"width": 20.0}},
         64,
     ),
@@ -93,7 +86,7 @@ def test_auto_is_all_within_the_tolerance(scene: str) -> None:
 @pytest.mark.parametrize("mode", ["-parallax", "all,-parallax"])
 def test_reference_pictures_leave_out_what_the_user_switches_off(mode: str) -> None:
     """Effects that need it are off, too."""
-    job = job_of(stuff(fractal(16, 16, 2.0), 0.1), mode)
+    job = job_of(height_field(fractal(16, 16, 2.0), 0.1), mode)
     build_estimator(job, reference_plan(job))
 
 

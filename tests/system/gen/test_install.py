@@ -22,12 +22,11 @@ def test_a_healthy_installation_passes_its_checks(run_python: RunPython) -> None
 
 
 def test_the_physics_is_right_on_this_machine(run_python: RunPython) -> None:
-    done = run_python("-m", "mbtf_gen", "selftest", "--time", "1s", "--json", "--quiet")
+    done = run_python("-m", "mbtf_gen", "selftest", "--json", "--quiet")
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads(done.stdout)
     assert found["ok"]
     assert {c["state"] for c in found["checks"]} <= {"ok", "absent"}
-    assert all(c["worst"] is not None for c in found["checks"] if c["required"])
 
 
 @pytest.mark.parametrize("command", [[], ["reference"]], ids=["generate", "reference"])

@@ -1,4 +1,4 @@
-"""Forecasts: bytes, noise, seconds; long commands state them before they start."""
+"""Forecasts: bytes, noise, seconds; what does not fit on the disk is refused."""
 
 from __future__ import annotations
 
@@ -15,13 +15,11 @@ import pytest
 from mbtf_core import forecast as core
 from mbtf_core.app.console import run
 from mbtf_core.data.schema import Queries
-from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.files import folders
 from mbtf_gen import forecast as module
 from mbtf_gen.cli.app import app
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.forecast import forecast
-from mbtf_gen.generation import run as generation
 from mbtf_gen.job import Job
 from mbtf_gen.planning import sample_allocation
 from mbtf_gen.planning.run_plan import RunPlan, allocate, plan_effects
@@ -163,42 +161,3 @@ def test_what_does_not_fit_is_refused_before_anything_is_written(
     assert "1.0 MB are free" in message
     assert "-o" in message.splitlines()[-1]
     assert not out.exists()
-
-
-def stop(*_: Any, **__: Any) -> Any:
-    raise KeyboardInterrupt
-
-
-def test_a_long_run_states_time_and_size(
-    heights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Before the first shard, and, for a new data set, before its folder is made."""
-    out = heights.parent / "out"
-    seen: list[bool] = []
-
-    def pilot(*_: Any, **__: Any) -> Any:
-        seen.append(out.exists())
-        return SimpleNamespace(start=5.0, seconds=600.0)
-
-    monkeypatch.setattr(generation, "open_folder", lambda job, folder, plan, overwrite: stop(plan(job)))
-    monkeypatch.setattr(module, "LONG_RUN", 1)
-    monkeypatch.setattr(module, "forecast", pilot)
-    plan = SimpleNamespace(effects=SimpleNamespace(closed_form=False))
-    monkeypatch.setattr(generation, "plan_run", lambda *_: plan)
-    words = [
-        str(heights),
-        "--height-scale",
-        "0.01",
-        "--quality",
-        "draft",
-        "--resolution",
-        "64",
-        "-o",
-        str(out),
-    ]
-    assert run(app, words) == 130
-    size = f"{(400 * 64**2 + 65536) * row_bytes(holes=False) / 1e6:.0f} MB"
-    err = capsys.readouterr().err
-    assert f"resolution 64, {size}" in err
-    assert f"expected: about 10:05, {size} on disk; faster: --queries 100/texel" in err
-    assert seen == [False]

@@ -18,7 +18,6 @@ from mbtf_core.data.geometry import Geometry
 from mbtf_core.data.shard_files import read_shard
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError, PartialError
-from mbtf_core.stats import pooled_relative_error
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation import folder
@@ -105,21 +104,6 @@ def test_one_sample_in_a_million_may_be_nonfinite(count: int, paths: int, refuse
     statistics.counts["nonfinite_samples"] = count
     with pytest.raises(PartialError) if refused else contextlib.nullcontext():
         statistics.refuse_nonfinite(paths, "out")
-
-
-def test_the_error_of_the_noise_is_that_of_all_queries() -> None:
-    """By the spread of 32 shards, as from the queries themselves."""
-    random, statistics = np.random.default_rng(0), ShardStatistics()
-    noise = 0.3 * random.gamma(0.5, 2.0, (32, 500, 1))
-    a, b = (1.0 + noise * random.normal(size=(32, 500, 3)) for _ in range(2))
-    for one, other in zip(a, b, strict=True):
-        means = {"mean_value": (one + other).mean(0) / 2, "mean_variance": ((one - other) ** 2 / 4).mean(0)}
-        counts = {**dict.fromkeys(statistics.counts, 0), "nonfinite_at": []}
-        record = {"split": "train", "queries": 500, "paths": 0, "seconds": 0.0, "target": None}
-        statistics.add({**record, "quarantined": counts, "statistics": means})
-    expected = pooled_relative_error(a.reshape(-1, 3), b.reshape(-1, 3))
-    assert statistics.relative_error() == pytest.approx(expected.value)
-    assert statistics.relative_error_se() == pytest.approx(expected.error, rel=0.4)
 
 
 def test_a_finished_run_renders_nothing(

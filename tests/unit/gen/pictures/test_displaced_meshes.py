@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -78,21 +77,6 @@ def test_too_many_triangles_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="at most 16,777,216") as caught:
         mesh.mesh(HeightGrid(np.zeros((1024, 1024)), 1.0), {"type": "diffuse"})
     assert caught.value.hint == "give --mesh 40, or fewer --tiles-per-uv"
-
-
-@pytest.mark.parametrize(
-    ("options", "what"),
-    [
-        ({"surface": "cube"}, "or a mesh"),
-        ({"surface": "cube.stl"}, "or a mesh"),
-        ({"tiles": 5}, "a plane has no number of tiles"),
-        ({"surface": "torus", "tiles": 5.5}, "whole number"),
-        ({"surface": "cow.ply", "kind": "query"}, "only a plane"),
-    ],
-)
-def test_options_that_no_surface_has(options: dict[str, Any], what: str) -> None:
-    with pytest.raises(InputError, match=what):
-        ReferenceConfig.model_validate({"material": "m", "reference": options})
 
 
 def test_a_picture_of_a_mesh(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from support.fit_data import constant, write_data
 from support.published import LAYOUTS, small
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_gen.publishing.picture import brdf_image, contrasted, tile_images, write_picture
+from mbtf_gen.publishing.picture import brdf_image, tile_image, write_picture
 
 
 def test_images_have_v_and_the_light_where_they_belong(tmp_path: Path) -> None:
@@ -23,7 +23,7 @@ def test_images_have_v_and_the_light_where_they_belong(tmp_path: Path) -> None:
 
     write_data(tmp_path / "data", value, train=60_000, test=10, finest=4)
     arrays = Dataset.open(tmp_path / "data").load("train")
-    tile = tile_images(arrays, 1.0, None)["all lights"]
+    tile = tile_image(arrays, 1.0, None)
     at = (np.arange(len(tile)) + 0.5) / len(tile)
     wave = np.broadcast_to(1.0 + 0.5 * np.sin(2 * np.pi * at), tile.shape[:2])
     np.testing.assert_allclose(tile[..., 0], wave, atol=0.1)
@@ -43,8 +43,7 @@ def test_highlights_that_few_queries_see_are_no_specks(tmp_path: Path) -> None:
     arrays = Dataset.open(tmp_path / "data").load("train")
     for key in ("value_a", "value_b"):
         arrays[key] = np.where(np.arange(20_000)[:, None] % 500 == 0, 100.0, arrays[key])
-    for panel in tile_images(arrays, 1.0, None).values():
-        assert np.nanmax(panel) < 0.16
+    assert np.nanmax(tile_image(arrays, 1.0, None)) < 0.16
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -54,12 +53,3 @@ def test_every_layout_has_its_picture(layout: str, tmp_path: Path, draws: None) 
     first = write_picture(*shown, tmp_path / "a.png")
     assert write_picture(*shown, tmp_path / "b.png").sha256 == first.sha256
     assert np.asarray(Image.open(tmp_path / "a.png").convert("L"), np.float64).std() > 5
-
-
-def test_contrast_keeps_colors_and_gaps() -> None:
-    image = np.array([[[0.2, 0.1, 0.1], [0.4, 0.2, 0.2]], [[0.0, 0.0, 0.0], [np.nan, np.nan, np.nan]]])
-    found = contrasted(image)
-    assert found[0, 1, 0] / found[0, 0, 0] > 2.5
-    np.testing.assert_allclose(found[0, :, 1] / found[0, :, 0], 0.5)
-    np.testing.assert_array_equal(np.isnan(found), np.isnan(image))
-    assert not found[1, 0].any()

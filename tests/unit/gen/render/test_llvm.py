@@ -80,29 +80,26 @@ def library(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return path
 
 
-def test_a_proof_is_cached_per_library(library: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    proofs = []
+def test_a_proof_is_cached_per_library_unless_it_fails(
+    library: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    proofs, fault = [], "the process was ended by SIGABRT (LLVM ERROR: Cannot select)"
 
     def prove(variant: str) -> object:
         proofs.append(variant)
-        return engine.ChildResult({"llvm": [20, 1, 2]}, "", 0.0)
+        return engine.ChildResult({"llvm": [20, 1, 2]}, fault, 0.0)
 
     monkeypatch.setattr(engine, "prove", prove)
-    engine.check_llvm()
-    engine.check_llvm()
-    assert len(proofs) == 1
-    library.write_bytes(b"changed")
-    engine.check_llvm()
-    assert len(proofs) == 2
-
-
-@pytest.mark.usefixtures("library")
-def test_a_failed_proof_is_not_cached(monkeypatch: pytest.MonkeyPatch) -> None:
-    fault = "the process was ended by SIGABRT (LLVM ERROR: Cannot select)"
-    monkeypatch.setattr(engine, "prove", lambda variant: engine.ChildResult({"llvm": [20, 1, 2]}, fault, 0.0))
     for _ in range(2):
         with pytest.raises(EngineError, match="ended by SIGABRT"):
             engine.check_llvm()
+    assert len(proofs) == 2
+    fault = ""
+    for content in (b"x", b"changed"):
+        library.write_bytes(content)
+        engine.check_llvm()
+        engine.check_llvm()
+    assert len(proofs) == 4
 
 
 SHOWN = """

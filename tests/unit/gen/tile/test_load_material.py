@@ -162,17 +162,6 @@ def test_an_unchanged_material_is_not_decoded_again(changing: Path) -> None:
     assert latest_material(changing, "mirror") is not first
 
 
-def test_an_unchanged_weave_is_not_built_again(tmp_path: Path) -> None:
-    path = tmp_path / "cloth.yaml"
-    path.write_text(
-        "weave: twill 2/1\nyarns: {a: '#20242f', b: '#e8e2d4'}\nwarp: a\nweft: b\n", encoding="utf-8"
-    )
-    first = latest_material(path)
-    assert latest_material(path) is first
-    path.write_text("weave: plain\nyarns: {a: '#20242f', b: '#e8e2d4'}\nwarp: a\nweft: b\n", encoding="utf-8")
-    assert latest_material(path) is not first
-
-
 def test_a_changed_folder_is_loaded_again(changing: Path) -> None:
     first = latest_material(changing)
     # As many bytes, and the same times, as before.

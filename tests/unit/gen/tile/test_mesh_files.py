@@ -12,9 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.fuzzing import damaged, examples, loads_or_refuses
 from support.gltf_files import TWO_TRIANGLES, GltfBuilder
+from support.jobs import job_of
 
-from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import plan_effects
 from mbtf_gen.tile.loading import load_material
 
@@ -137,6 +136,5 @@ def test_a_flat_mesh_is_zero_thick_and_traced_as_a_mesh(tmp_path: Path) -> None:
     (tmp_path / "flat.ply").write_text(PLY.replace("0.1", "0"))
     shape = load_material(tmp_path / "flat.ply")
     assert f"{shape.thickness:g}" == "0"
-    config = GeneratorConfig.model_validate({"material": "m"})
     # Where a ray meets a height map without heights is known, but not the triangle of a mesh.
-    assert "parallax" in {e.name for e in plan_effects(Job.of(config, shape), pilots=False).effects if e.on}
+    assert "parallax" in {e.name for e in plan_effects(job_of(shape), pilots=False).effects if e.on}

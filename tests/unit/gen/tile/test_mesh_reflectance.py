@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from support.gltf_files import SQUARE, GltfBuilder, png
+from support.jobs import job_of
 from support.scenes import mi
 
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.content import MeshShape, Texture, numbers_of
-from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job
 from mbtf_gen.planning.run_plan import plan_effects, reference_plan
 from mbtf_gen.tile.loading import latest_material, load_material
 from mbtf_gen.tile.mesh_file import with_one_wrap, with_vertex_colors
@@ -122,8 +121,7 @@ def test_a_clamped_texture_that_reaches_too_far_is_refused() -> None:
 
 def plans(tile: MeshTile, mode: str = "auto") -> tuple[set[str], set[str]]:
     """Reflections that a run and a reference picture simulate."""
-    config = GeneratorConfig.model_validate({"material": "m", "effects": {"mode": mode}})
-    job = Job.of(config, tile)
+    job = job_of(tile, mode)
     names = {"specular", "metallic", "clearcoat", "sheen"}
     return tuple(  # type: ignore[return-value]
         set(plan.names_on) & names for plan in (plan_effects(job, pilots=False), reference_plan(job))
