@@ -22,11 +22,10 @@ from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig, FitResult, Material, evaluate, fit
 from mbtf_fit.data.loader import load_split, load_training
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.evaluation import evaluate_splits, split_errors
+from mbtf_fit.evaluation import split_errors
 from mbtf_fit.formatting import report_errors
 from mbtf_fit.material.material import conformance_queries, export
 from mbtf_fit.models.registry import MODELS
-from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.trainer import prepare_trainer
 
 
@@ -193,16 +192,6 @@ def test_outliers_of_the_prediction_are_named(data: Path) -> None:
         line = "".join(report_errors({"test": found | {"n": 5000}}, None))
         for words in ("5.4 predicted for 0.6", f"level {level:.1f}", from_where, f"u ({u:.3f}, {v:.3f})"):
             assert (words in line) == named
-
-
-def test_a_test_set_whose_single_training_query_is_held_out_has_errors(tmp_path: Path) -> None:
-    opened = Dataset.open(write_data(tmp_path / "d", constant(0.25), train=1))
-    held_out = HeldOutSection(direction=(0.0, 0.0), radius=0.99)
-    partition = load_training(opened, held_out, 0, memory=None)
-    assert len(partition.selection) == 0
-    assert "training" not in evaluate_splits(lambda *q: np.ones((len(q[0]), 3)), opened, partition)
-    with pytest.raises(InputError, match="held out"):
-        load_training(opened, held_out, 0)
 
 
 def test_evaluation_refuses_a_tile_of_another_shape(fitted: FitResult, tmp_path: Path) -> None:

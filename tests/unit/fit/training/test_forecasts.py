@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,11 +14,8 @@ from support.fit_data import parallax, write_data
 import mbtf_fit.training.fit as fits
 import mbtf_fit.training.forecast as module
 import mbtf_fit.training.validation as validation
-from mbtf_core.app.console import run
-from mbtf_core.files import folders
 from mbtf_core.stats import Estimate, Interval, signal_variance
 from mbtf_fit import fit
-from mbtf_fit.cli.app import app
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.queries import ShardQueries
@@ -189,23 +184,3 @@ def test_the_last_validation_is_the_error_of_the_fit(shards: Path, tmp_path: Pat
     reached = found.errors["test"]["unexplained"]["value"]
     assert found.history[-1]["unexplained"] == pytest.approx(reached, rel=1e-5)
     assert found.errors["held_out_queries"]["unexplained"]["value"] != pytest.approx(reached, rel=1e-3)
-
-
-def test_a_long_fit_states_time_and_size(
-    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def stop(*_: Any, **__: Any) -> Any:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(fits, "fit", stop)
-    monkeypatch.setattr("mbtf_core.forecast.processor_share", lambda: 0.5)
-    out = tmp_path / "material"
-    assert run(app, [str(shards), "--time", "2min", "-o", str(out)]) == 130
-    # Loading and evaluation are included, and take longer where other work leaves less.
-    assert "expected: about 2:16, " in capsys.readouterr().err
-    assert run(app, [str(shards), "--time", "20s", "-o", str(out)]) == 130
-    assert "expected" not in capsys.readouterr().err
-    monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e4))
-    assert run(app, [str(shards), "-o", str(out)]) == 3
-    assert "10 kB are free" in capsys.readouterr().err
-    assert not out.exists()

@@ -260,20 +260,6 @@ def test_other_data_sets_are_another_fit(data: dict[str, Path], tmp_path: Path) 
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
-def test_divergence_names_the_material(
-    data: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    step = Trainer._step
-
-    def poisoned(self: Trainer, *arguments: Any) -> torch.Tensor:
-        loss = step(self, *arguments)
-        return loss * float("nan") if self.progress.step == 3 else loss
-
-    monkeypatch.setattr(Trainer, "_step", poisoned)
-    with pytest.raises(InputError, match=r"stripes: training diverged at step 4"):
-        fit_two(joint_config(steps=6), data, tmp_path)
-
-
 def test_other_architectures_are_refused(data: dict[str, Path], tmp_path: Path) -> None:
     fit(single_config(steps=2), data["waves"], tmp_path / "m")
     others: list[tuple[dict[str, Any], str]] = [
