@@ -17,12 +17,13 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+from pydantic import Field
 
-from mbtf_core.errors import UsageError
+from mbtf_core.config.settings import Settings
 from mbtf_core.pictures import PIXEL_SIGMA
 from mbtf_fit.backends.mitsuba.bsdf import MbtfBSDF, check_scene
 from mbtf_fit.backends.mitsuba.curvature import with_normal_partials
-from mbtf_fit.backends.mitsuba.names import INTEGRATOR_NAME, footprints_provided, refuse_unknown
+from mbtf_fit.backends.mitsuba.names import INTEGRATOR_NAME, footprints_provided, options_of
 from mbtf_fit.ops.constants import MAX_ANISOTROPY
 from mbtf_gen.engine.types import (
     DirectionSample3f,
@@ -126,6 +127,15 @@ def may_curve(scene: Scene) -> bool:
     return unknown or any(material.shell is not None for material in materials_of(scene))
 
 
+class PathOptions(Settings):
+    """Parameters of :class:`ConePath`."""
+
+    max_depth: int = Field(-1, ge=-1)
+    rr_depth: int = Field(5, ge=1)
+    hide_emitters: bool = False
+    max_anisotropy: float = Field(MAX_ANISOTROPY, ge=1, le=1024)
+
+
 class ConePath(mi.SamplingIntegrator):
     """Path tracing with emitter sampling and multiple importance sampling, with ray cones.
 
@@ -140,17 +150,11 @@ class ConePath(mi.SamplingIntegrator):
 
     def __init__(self, props: Properties) -> None:
         super().__init__(props)
-        depth = int(props.get("max_depth", -1))
-        self.max_depth = 0xFFFFFFFF if depth < 0 else depth
-        self.rr_depth = int(props.get("rr_depth", 5))
-        if depth < -1 or self.rr_depth < 1:
-            raise UsageError("max_depth must be at least -1, rr_depth at least 1", where=INTEGRATOR_NAME)
-        self.hidden = bool(props.get("hide_emitters", False))
-        most = float(props.get("max_anisotropy", MAX_ANISOTROPY))
-        self.round, self.anisotropy = most == 1.0, dr.opaque(mi.Float, most)
-        if not 1.0 <= most <= 1024.0:
-            raise UsageError("max_anisotropy must be between 1 and 1024", where=INTEGRATOR_NAME)
-        refuse_unknown(props, ("max_depth", "rr_depth", "hide_emitters", "max_anisotropy"), INTEGRATOR_NAME)
+        options = options_of(props, PathOptions, INTEGRATOR_NAME)
+        self.max_depth = 0xFFFFFFFF if options.max_depth < 0 else options.max_depth
+        self.rr_depth, self.hidden = options.rr_depth, options.hide_emitters
+        self.round = options.max_anisotropy == 1.0
+        self.anisotropy = dr.opaque(mi.Float, options.max_anisotropy)
 
     def render(self, scene: Scene, *arguments: Any, **options: Any) -> Any:
         """Render after a check of the scene.

@@ -221,9 +221,9 @@ def scene_of(folder: Path | str, **options: Any) -> dict[str, Any]:
     ("options", "fault", "kind"),
     [
         ({"material": "nowhere"}, "nowhere: no such folder", InputError),
-        ({"uv_scale": -1.0}, "uv_scale must be a positive number", UsageError),
-        ({"networks": "exact"}, "networks must be one of", UsageError),
-        ({"uvscale": 4.0}, "has no parameter 'uvscale'\n  did you mean 'uv_scale'?", UsageError),
+        ({"uv_scale": -1.0}, "'uv_scale.0': must be greater than 0", UsageError),
+        ({"networks": "exact"}, "'networks': must be 'unrolled'", UsageError),
+        ({"uvscale": 4.0}, "unknown key 'uvscale'\n  did you mean 'uv_scale'?", UsageError),
     ],
 )
 def test_errors_of_a_scene_are_one_line(
