@@ -53,12 +53,9 @@ def write_maps(
 
     Raises
     ------
-    UsageError
-        The material has no such level.
-    EngineError
-        The library is not installed.
-    PartialError
-        The folder cannot be written.
+    UsageError : the material has no such level
+    EngineError : the library is not installed
+    PartialError : the folder cannot be written
     """
     if not has_extra(module):
         raise extra_error(module, name)

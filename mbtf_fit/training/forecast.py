@@ -91,8 +91,7 @@ def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForec
     Parameters
     ----------
     config : FitConfig
-    shards : str, Path or DataFolder
-        Data set.
+    shards : data set
 
     Returns
     -------
@@ -100,8 +99,7 @@ def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForec
 
     Raises
     ------
-    InputError
-        The data set cannot be read, or suits another model.
+    InputError : the data set cannot be read, or suits another model
     """
     began = time.perf_counter()
     data = open_data(shards, config.model, config.data.cache)

@@ -80,8 +80,7 @@ def read_material(folder: str | Path) -> StoredMaterial:
 
     Parameters
     ----------
-    folder : str or Path
-        Folder made by ``mbtf-fit``.
+    folder : folder made by ``mbtf-fit``
 
     Returns
     -------
@@ -89,8 +88,7 @@ def read_material(folder: str | Path) -> StoredMaterial:
 
     Raises
     ------
-    InputError
-        The folder is missing, corrupt, or of another schema.
+    InputError : the folder is missing, corrupt, or of another schema
     """
     folder = Path(folder)
     description, weights = read_description(folder)
