@@ -108,23 +108,15 @@ def camera_cone(ray: Ray3f, samples: int) -> tuple[Float, Float]:
     return tuple(scale * dr.sqrt(dr.abs(dr.dot(area, ray.d))) for area in (width, spread))
 
 
-def materials_of(scene: Scene) -> list[Any]:
-    """The ``mbtf`` materials of a scene's surfaces, each once; not those inside other BSDFs or instances."""
-    found = {id(bsdf): bsdf for bsdf in (s.bsdf() for s in scene.shapes()) if isinstance(bsdf, MbtfBSDF)}
-    return [*found.values()]
-
-
-def may_transmit(scene: Scene) -> bool:
-    """Whether a surface of the scene may transmit light without refraction; True if unknown."""
+def surfaces_of(scene: Scene) -> tuple[bool, bool, list[Any]]:
+    """Whether a surface of a scene may transmit light without refraction, and whether one may trace heights
+    over its curvature, both True if unknown; and the ``mbtf`` materials, each once, without those inside
+    other BSDFs or instances."""
     surfaces = [shape.bsdf() for shape in scene.shapes()]
-    return any(bsdf is None or mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in surfaces)
-
-
-def may_curve(scene: Scene) -> bool:
-    """Whether a surface of the scene may trace heights over its curvature; True if unknown."""
-    others = [b for b in (s.bsdf() for s in scene.shapes()) if not isinstance(b, MbtfBSDF)]
-    unknown = any(b is None or mi.has_flag(b.flags(), mi.BSDFFlags.Null) for b in others)
-    return unknown or any(material.shell is not None for material in materials_of(scene))
+    materials = [*{id(bsdf): bsdf for bsdf in surfaces if isinstance(bsdf, MbtfBSDF)}.values()]
+    passing = [b for b in surfaces if b is None or mi.has_flag(b.flags(), mi.BSDFFlags.Null)]
+    unknown = any(not isinstance(bsdf, MbtfBSDF) for bsdf in passing)
+    return bool(passing), unknown or any(m.shell is not None for m in materials), materials
 
 
 class PathOptions(Settings):
@@ -174,8 +166,8 @@ class ConePath(mi.SamplingIntegrator):
         token = footprints_provided.set(True)
         try:
             cone = (mi.Ray3f(ray), width, spread)
-            materials = [] if self.round else materials_of(scene)
-            known = (may_transmit(scene), may_curve(scene), materials)
+            transmits, curved, materials = surfaces_of(scene)
+            known = (transmits, curved, [] if self.round else materials)
             return *self._trace(scene, sampler, *cone, mi.Bool(active), *known), []
         finally:
             footprints_provided.reset(token)
