@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +13,13 @@ from support.fit_data import parallax, write_data
 import mbtf_fit.training.fit as fits
 import mbtf_fit.training.forecast as module
 import mbtf_fit.training.validation as validation
-from mbtf_core.stats import Estimate, Interval, signal_variance
+from mbtf_core.stats import Estimate, signal_variance
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.endings import reached
-from mbtf_fit.training.error_forecast import ErrorForecast
 from mbtf_fit.training.forecast import forecast_fit
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.suitable_data import open_data
@@ -96,17 +94,6 @@ def test_the_law_of_the_pilots_predicts_the_fit(law: list[tuple[int, int]], shar
     # Below the level at which the law ends.
     below = forecast_fit(config(steps=STEPS, error=0.01), shards).error.describe()
     assert "not reachable with these queries" in below
-
-
-def test_an_error_above_all_bounds_is_reached_in_the_time() -> None:
-    """Although when it is reached is known to a factor of more than thirty only."""
-    error, time = Interval(0.019, 0.012, 0.024), Interval(20.0, 0.5, 280.0)
-    limit = Interval(0.01, 0.0, 0.02)
-    found = ErrorForecast(300.0, error, (0.05, time), limit).describe()
-    assert "error 0.05: reached within 5:00" in found
-    # Overfitting may add more.
-    above = ErrorForecast(300.0, replace(error, high=0.06), (0.05, replace(time, high=math.inf)), limit)
-    assert "reached" not in above.describe()
 
 
 def test_too_few_steps_give_no_forecast(law: list[tuple[int, int]], shards: Path) -> None:
