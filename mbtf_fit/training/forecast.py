@@ -88,15 +88,6 @@ def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForec
 
     Takes a tenth to a half of the fit's steps, see :mod:`~mbtf_fit.training.error_forecast`.
 
-    Parameters
-    ----------
-    config : FitConfig
-    shards : data set
-
-    Returns
-    -------
-    FitForecast
-
     Raises
     ------
     InputError : the data set cannot be read, or suits another model

@@ -126,9 +126,12 @@ class Evaluator:
 
         Parameters
         ----------
-        u : (n, 2), positions on the reference plane, uv; the tile repeats
-        sigma : (n,), standard deviations of the footprints in tile widths
-        omega_i, omega_o : (n, 3), unit vectors towards light and viewer, z > 0
+        u : (n, 2) float array
+            Positions on the reference plane, uv; the tile repeats.
+        sigma : (n,) float array
+            Standard deviations of the footprints in tile widths.
+        omega_i, omega_o : (n, 3) float array
+            Unit vectors towards light and viewer, z > 0.
 
         Returns
         -------
