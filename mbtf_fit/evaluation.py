@@ -56,12 +56,10 @@ def split_errors(
 
     Parameters
     ----------
-    predict : callable
-        Values (n, 3) of queries.
+    predict : values (n, 3) of queries
     queries : ShardQueries
     data : Dataset
-    exposure : float, optional
-        In EV, see :mod:`mbtf_core.color`; by default that of the queries.
+    exposure : in EV, see :mod:`mbtf_core.color`; by default that of the queries
 
     Returns
     -------

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict, make_dataclass
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from cyclopts import Group, Parameter
+from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Output, Overwrite
-from mbtf_core.config.settings import Settings, build
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.files.folders import OutputKind
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_fit.export import Export, targets
+from mbtf_fit.export.images import MapOptions
+from mbtf_fit.export.slang import ShaderOptions
+from mbtf_fit.export.web import PageOptions
 from mbtf_fit.material.texture_formats import TextureFormat
 
 if TYPE_CHECKING:
@@ -25,53 +26,6 @@ else:
     Name = Literal[tuple(targets())]
 
 EXPORT = OutputKind("export.json", "mbtf-export", 3, "an export")
-
-S = TypeVar("S", bound=Settings)
-F = TypeVar("F", bound="SectionFlags")
-
-
-class SectionFlags:
-    """Values of the flags of some sections; made by :func:`flags_of`."""
-
-    def given(self, kind: type[Settings]) -> dict[str, Any]:
-        """Those of a section that were given, by key."""
-        values = {key: getattr(self, key) for key in kind.model_fields}
-        return {key: value for key, value in values.items() if value is not None}
-
-    def section(self, kind: type[S]) -> S:
-        """A section."""
-        flags = {key: flag_of(key) for key in kind.model_fields}
-        return build(kind, self.given(kind), source="command line", error=UsageError, spelled=flags)
-
-
-def flag_of(key: str) -> str:
-    """The flag of a key."""
-    return f"--{key.replace('_', '-')}"
-
-
-def flags_of(*kinds: type[Settings]) -> Callable[[type[F]], type[F]]:
-    """Decorator of a class of :class:`SectionFlags`: gives it a flag per key of some sections."""
-    fields: list[tuple[str, Any, None]] = []
-    for kind in kinds:
-        for key, field in kind.model_fields.items():
-            text = f"{field.description or ''}."
-            group = Group(kind.__name__.removesuffix("Options"), sort_key=0)
-            default = False if field.default is None else str(field.default)
-            shown = Parameter(help=text[:1].upper() + text[1:], group=group, show_default=default)
-            fields.append((key, Annotated[Optional[field.annotation], shown], None))  # noqa: UP045
-
-    def decorate(cls: type[F]) -> type[F]:
-        names = {"__module__": cls.__module__, "__doc__": cls.__doc__}
-        made: Any = make_dataclass(cls.__name__, fields, bases=(cls,), namespace=names, frozen=True)
-        found: type[F] = Parameter(name="*")(made)
-        return found
-
-    return decorate
-
-
-@flags_of(*dict.fromkeys(t.options for t in targets().values() if t.options is not None))
-class TargetFlags(SectionFlags):
-    """Options of the formats."""
 
 
 def export_material(
@@ -88,7 +42,9 @@ def export_material(
     ] = None,
     output: Annotated[Output | None, Parameter(show_default="the material's own")] = None,
     texture_format: Annotated[TextureFormat | None, Parameter(show_default="the material's own")] = None,
-    flags: TargetFlags = TargetFlags(),  # noqa: B008
+    maps: MapOptions = MapOptions(),  # noqa: B008
+    page: PageOptions = PageOptions(),  # noqa: B008
+    shader: ShaderOptions = ShaderOptions(),  # noqa: B008
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
@@ -111,22 +67,24 @@ def export_material(
     from mbtf_fit.material.rounding import round_material
 
     wanted = [targets()[name] for name in dict.fromkeys(to or ["exr", "json"])]
-    for target in targets().values():
-        users = [t.name for t in targets().values() if t.options is target.options]
-        if target.options and flags.given(target.options) and not {t.name for t in wanted} & set(users):
-            flag = flag_of(next(iter(flags.given(target.options))))
+    sections: dict[Any, Any] = {type(section): section for section in (maps, page, shader)}
+    given = {kind: {k: v for k, v in vars(s).items() if v is not None} for kind, s in sections.items()}
+    for kind, flags in given.items():
+        users = [t.name for t in targets().values() if t.options is kind]
+        if flags and not {t.name for t in wanted} & set(users):
+            flag = f"--{next(iter(flags)).replace('_', '-')}"
             raise UsageError(f"is an option of {', '.join(users)}", where=flag, hint=f"add --to {users[0]}")
-        if texture_format and target in wanted and not target.rounds:
+    for target in wanted:
+        if texture_format and not target.rounds:
             hint = "leave it out, or export the other formats by a command of their own"
             raise UsageError(f"has no meaning for {target.name}", where="--texture-format", hint=hint)
-    options = [None if target.options is None else flags.section(target.options) for target in wanted]
     loaded, folder = Material.load(material), material if output is None else output
     keep_on_interruption(f"the finished files are kept in {folder}")
     depends = {
         "material": file_sha256(material / DESCRIPTION_NAME),
         "to": sorted(target.name for target in wanted),
         "texture_format": texture_format,
-        "options": {key: digest_of(v) for key, v in sorted(vars(flags).items()) if v is not None},
+        "options": {k: digest_of(v) for k, v in sorted(kv for f in given.values() for kv in f.items())},
     }
     # Files of other formats may lie in the material's own folder.
     beside = folder.is_dir() and folder.samefile(material)
@@ -153,8 +111,8 @@ def export_material(
         if error is not None:
             export.notes.append(str(error))
         files: list[str] = []
-        for target, section in zip(wanted, options, strict=True):
-            files += target.write(export, section)
+        for target in wanted:
+            files += target.write(export, sections.get(target.options))
         if claimed is not None:
             claimed.keep(EXPORT.format, [folder / name for name in dict.fromkeys(files)], {})
     sizes = {name: (folder / name).stat().st_size for name in dict.fromkeys(files)}

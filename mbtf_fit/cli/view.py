@@ -11,20 +11,14 @@ from cyclopts import Parameter
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import whole_number
 from mbtf_core.run.signals import served_until_interruption
-from mbtf_fit.cli.export import SectionFlags, flags_of
 from mbtf_fit.export.web import PageOptions, make_page
-
-
-@flags_of(PageOptions)
-class PageFlags(SectionFlags):
-    """What the page shows besides the material."""
 
 
 def view(
     material: Path,
     /,
     *,
-    flags: PageFlags = PageFlags(),  # noqa: B008
+    page: PageOptions = PageOptions(),  # noqa: B008
     port: Annotated[int, Parameter(converter=whole_number)] = 0,
     console: Console = CONSOLE,
 ) -> None:
@@ -45,7 +39,7 @@ def view(
     """
     from mbtf_fit.viewer.server import PageServer
 
-    html, precision = make_page(material, flags.section(PageOptions))
+    html, precision = make_page(material, page)
     server = PageServer(html, port)
     console.note(precision)
     with served_until_interruption():

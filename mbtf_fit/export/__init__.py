@@ -14,12 +14,18 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cyclopts import Group, Parameter
+
 from mbtf_core.app.console import Console
-from mbtf_core.config.settings import Settings
 from mbtf_fit.material.texture_formats import TextureFormat
 
 if TYPE_CHECKING:
     from mbtf_fit.material.material import Material
+
+
+def flags(group: str) -> Parameter:
+    """Decorator of a dataclass whose fields, all optional, are flags in a group of the command's help."""
+    return Parameter(name="*", group=Group(group, sort_key=0), show_default=False)
 
 
 @dataclass
@@ -60,7 +66,7 @@ class ExportTarget:
     help : what it is, for the help of the command
     files : names of all files that it may write
     write : writes them for an :class:`Export`, with its options, and returns the names of those written
-    options : section whose fields are flags of the command; targets may share one
+    options : class whose fields are flags of the command; targets may share one
     rounds : whether it can be written with ``--texture-format``
     """
 
@@ -68,7 +74,7 @@ class ExportTarget:
     help: str
     files: Sequence[str]
     write: Callable[[Export, Any], list[str]]
-    options: type[Settings] | None = None
+    options: type[Any] | None = None
     rounds: bool = True
 
 

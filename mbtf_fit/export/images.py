@@ -5,17 +5,16 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import Field
 
-from mbtf_core.config.settings import Settings
 from mbtf_core.extras import extra_error, has_extra
 from mbtf_core.files.atomic import write_chunks, write_text
 from mbtf_core.paths import real_path
-from mbtf_fit.export import Export, ExportTarget
+from mbtf_fit.export import Export, ExportTarget, flags
 
 if TYPE_CHECKING:
     from mbtf_fit.material.maps import Maps
@@ -25,10 +24,18 @@ COAT = "clearcoat.png"
 IMAGE_NAMES = (BASE_COLOR, NORMAL, ORM, HEIGHT, COAT)
 
 
-class MapOptions(Settings):
-    """Options of maps."""
+@flags("Map")
+@dataclass(frozen=True)
+class MapOptions:
+    """Options of maps.
 
-    level: int | None = Field(None, description="level of the maps; default: the finest")
+    Attributes
+    ----------
+    level
+        Level of the maps; default: the finest.
+    """
+
+    level: int | None = None
 
 
 def write_maps(
@@ -53,12 +60,9 @@ def write_maps(
 
     Raises
     ------
-    UsageError
-        The material has no such level.
-    EngineError
-        The library is not installed.
-    PartialError
-        The folder cannot be written.
+    UsageError : the material has no such level
+    EngineError : the library is not installed
+    PartialError : the folder cannot be written
     """
     if not has_extra(module):
         raise extra_error(module, name)

@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
-from pydantic import Field
-
-from mbtf_core.config.settings import Settings
 from mbtf_core.errors import UsageError
 from mbtf_fit.backends.shader.syntax import ENDINGS, PLAIN_TARGETS, Target
-from mbtf_fit.export import Export, ExportTarget
+from mbtf_fit.export import Export, ExportTarget, flags
 
 
-class ShaderOptions(Settings):
-    """Options of shader modules."""
+@flags("Shader")
+@dataclass(frozen=True)
+class ShaderOptions:
+    """Options of shader modules.
 
-    shader_target: list[Target] | None = Field(
-        None, description="another language that Slang compiles the module to (extra 'shaders'). Repeatable"
-    )
-    shader_networks: Literal["plain", "cooperative"] | None = Field(
-        None,
-        description="networks of the other language: loops, or cooperative vectors in half precision, as the "
-        "module has both",
-    )
+    Attributes
+    ----------
+    shader_target
+        Another language that Slang compiles the module to (extra 'shaders'). Repeatable.
+    shader_networks
+        Networks of the other language: loops, or cooperative vectors in half precision, as the module has
+        both.
+    """
+
+    shader_target: list[Target] | None = None
+    shader_networks: Literal["plain", "cooperative"] | None = None
 
 
 def write(export: Export, options: ShaderOptions) -> list[str]:

@@ -2,32 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
-from pydantic import Field
-
-from mbtf_core.config.settings import Settings
 from mbtf_core.files.editable import write_document
-from mbtf_fit.export import Export, ExportTarget
+from mbtf_fit.export import Export, ExportTarget, flags
 
 PAGE_NAME = "viewer.html"
 
 
-class PageOptions(Settings):
-    """What a page shows besides the material."""
+@flags("Page")
+@dataclass(frozen=True)
+class PageOptions:
+    """What a page shows besides the material.
 
-    against: list[Path] | None = Field(
-        None, description="another material to compare with in the page. Repeatable"
-    )
-    reference: Path | None = Field(
-        None, description="folder of mbtf-gen reference to compare with in the page"
-    )
-    shape: Path | None = Field(
-        None, description="mesh with texture coordinates, as another shape of the page"
-    )
-    environment: Path | None = Field(
-        None, description="picture of the surroundings (EXR, HDR, PNG), as light in the page"
-    )
+    Attributes
+    ----------
+    against
+        Another material to compare with in the page. Repeatable.
+    reference
+        Folder of mbtf-gen reference to compare with in the page.
+    shape
+        Mesh with texture coordinates, as another shape of the page.
+    environment
+        Picture of the surroundings (EXR, HDR, PNG), as light in the page.
+    """
+
+    against: list[Path] | None = None
+    reference: Path | None = None
+    shape: Path | None = None
+    environment: Path | None = None
 
 
 def make_page(material: Path, options: PageOptions) -> tuple[str, str]:

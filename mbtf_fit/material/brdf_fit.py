@@ -82,10 +82,8 @@ class Pairs:
 
     Attributes
     ----------
-    light, view, half : (3, k) or (3, n, k) tensors
-        Unit vectors towards light and viewer, and between both.
-    schlick : (k,) or (n, k) tensor
-        ``(1 - ω_o·h)^5``.
+    light, view, half : (3, k) or (3, n, k), unit vectors towards light and viewer, and between both
+    schlick : (k,) or (n, k), ``(1 - ω_o·h)^5``
     """
 
     light: Tensor
@@ -111,12 +109,10 @@ def reflectance(lobes: Tensor, dielectric: float, pairs: Pairs) -> tuple[Tensor,
 
     Parameters
     ----------
-    lobes : (4, n, 1) or (4, n, k) tensor
-        ∂z/∂x and ∂z/∂y of the shading normal, the square root of α of GGX (roughness), the share of metal.
-    dielectric : float
-        F0 of the dielectric.
-    pairs : Pairs
-        k pairs.
+    lobes : (4, n, 1) or (4, n, k), ∂z/∂x and ∂z/∂y of the shading normal, the square root of α of GGX
+        (roughness), the share of metal
+    dielectric : F0 of the dielectric
+    pairs : k pairs
 
     Returns
     -------
@@ -300,10 +296,8 @@ def fit_texels(material: Material, level: int, u: F64, dielectric: float) -> tup
     ----------
     material : Material
     level : int
-    u : (n, 2) array
-        Centers of the texels, uv.
-    dielectric : float
-        F0; with 0, roughness is 1 and metallic 0.
+    u : (n, 2), centers of the texels, uv
+    dielectric : F0; with 0, roughness is 1 and metallic 0
 
     Returns
     -------
@@ -347,8 +341,7 @@ def fit_tile(
     ----------
     material : Material
     level : int
-    advance : callable
-        Called with the number of texels done since the last call.
+    advance : called with the number of texels done since the last call
 
     Returns
     -------

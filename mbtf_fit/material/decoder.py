@@ -34,11 +34,7 @@ class Decoder:
 
     @classmethod
     def find(cls, folder: str | Path) -> Decoder:
-        """Find the network of a material.
-
-        Parameters
-        ----------
-        folder : folder of the material
+        """The network of a material.
 
         Raises
         ------
@@ -60,10 +56,6 @@ class Decoder:
     def check(self, config: FitConfig) -> None:
         """Refuse a fit of another model or architecture.
 
-        Parameters
-        ----------
-        config : options of the fit
-
         Raises
         ------
         InputError : the fit cannot have this network
@@ -78,11 +70,7 @@ class Decoder:
                 )
 
     def load(self, model: NeuralMaterial) -> None:
-        """Give a model this network, which training then keeps.
-
-        Parameters
-        ----------
-        model : model of a fit, initialized
+        """Give an initialized model this network, which training then keeps.
 
         Raises
         ------

@@ -51,20 +51,15 @@ class Maps:
     Attributes
     ----------
     level : int
-    aspect : float
-        Height of the tile over its width.
-    base_color : (rows, columns, 3) array
-        Linear, in [0, 1].
-    slopes : (rows, columns, 2) array
-        ∂z/∂x and ∂z/∂y.
-    roughness, metallic, opacity : (rows, columns) arrays
-        In [0, 1]; opacity towards the normal.
-    dielectric : float
-        F0 of the dielectric; 0 for a surface without gloss.
-    heights : (H, W) array or None
-        In tile widths, at most 0, on the grid that rays are traced to; None of a model that knows no surface.
-    coat : (rows, columns, 2) array or None
-        Weight and roughness of the clear coat, whose normal is that of the rest; None without one.
+    aspect : height of the tile over its width
+    base_color : (rows, columns, 3), linear, in [0, 1]
+    slopes : (rows, columns, 2), ∂z/∂x and ∂z/∂y
+    roughness, metallic, opacity : (rows, columns), in [0, 1]; opacity towards the normal
+    dielectric : F0 of the dielectric; 0 for a surface without gloss
+    heights : (H, W), in tile widths, at most 0, on the grid that rays are traced to; None of a model that
+        knows no surface
+    coat : (rows, columns, 2), weight and roughness of the clear coat, whose normal is that of the rest; None
+        without one
     """
 
     level: int
@@ -235,10 +230,8 @@ def make_maps(material: Material, level: int | None, console: Console) -> tuple[
     Parameters
     ----------
     material : Material
-    level : int or None
-        The finest by default.
-    console : Console
-        For the progress of a fit.
+    level : the finest by default
+    console : for the progress of a fit
 
     Returns
     -------
@@ -246,8 +239,7 @@ def make_maps(material: Material, level: int | None, console: Console) -> tuple[
 
     Raises
     ------
-    UsageError
-        The material has no such level.
+    UsageError : the material has no such level
     """
     finest = material.lattice.finest
     level = finest if level is None else level

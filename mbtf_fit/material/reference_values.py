@@ -113,8 +113,7 @@ def texel_values(material: Material, level: int, u: F64, omega_i: F64, omega_o: 
     ----------
     material : Material
     level : int
-    u : (n, k, 2) array
-        Positions, uv.
+    u : (n, k, 2), positions, uv
     omega_i, omega_o : (k, 3) or (n, k, 3) arrays
 
     Returns

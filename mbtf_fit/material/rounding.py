@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 
 from mbtf_core.errors import InputError
@@ -20,18 +21,27 @@ class RoundingError:
 
     Attributes
     ----------
-    form : of the textures
+    form : of the textures, or how they are stored
     count : queries
     largest : largest absolute difference, in 1/sr
     rms : root mean square difference, in 1/sr
     relative : that over the root mean square value; None where all values are 0
     """
 
-    form: TextureFormat
+    form: str
     count: int
     largest: float
     rms: float
     relative: float | None
+
+    @classmethod
+    def between(cls, form: str, before: ArrayLike, after: ArrayLike) -> RoundingError:
+        """Of values (n, 3) before and after."""
+        exact = np.asarray(before, np.float64)
+        difference = np.asarray(after, np.float64) - exact
+        rms, power = float(np.sqrt((difference**2).mean())), float(np.sqrt((exact**2).mean()))
+        largest = float(np.abs(difference).max())
+        return cls(form, len(exact), largest, rms, rms / power if power else None)
 
     def __str__(self) -> str:
         share = "" if self.relative is None else f" ({self.relative:.2g} of the rms value)"
@@ -86,11 +96,7 @@ def round_material(material: Material, form: TextureFormat) -> tuple[Material, R
         levels = enumerate(map(torch.from_numpy, transmittance.levels))
         halves = [_round_to_half(f"transmittance.{s}", texels).numpy() for s, texels in levels]
         transmittance = replace(transmittance, levels=halves)
-    before = material.conformance["rgb"].astype(np.float64)
     after = conformance_values(model, material.conformance)
-    difference = after.astype(np.float64) - before
-    rms, power = float(np.sqrt((difference**2).mean())), float(np.sqrt((before**2).mean()))
-    largest = float(np.abs(difference).max())
-    error = RoundingError(form, len(before), largest, rms, rms / power if power else None)
+    error = RoundingError.between(form, material.conformance["rgb"], after)
     conformance = {**material.conformance, "rgb": after}
     return replace(material, model=model, conformance=conformance, transmittance=transmittance), error

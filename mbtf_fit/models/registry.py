@@ -4,16 +4,14 @@ any file, by its path and their class."""
 
 from __future__ import annotations
 
-import builtins
 import importlib
 import pkgutil
-import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
-from traceback import extract_tb, walk_tb
+from traceback import extract_tb
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -119,26 +117,13 @@ def _faults_of(name: str) -> Iterator[None]:
             raise
         path, _ = file_and_class(name) or ("", name)
         places = [(frame.filename, frame.lineno) for frame in extract_tb(error.__traceback__)]
-        what, hint = reason(error), _suggest(error) or "correct the file; --debug shows the traceback"
+        what, hint = reason(error), "correct the file; --debug shows the traceback"
         if isinstance(error, SyntaxError):
             what = reason(error.msg)
             places.append((error.filename or "", error.lineno))
         lines = [line for file, line in places if file == path]
         where = f"{path}:{lines[-1]}" if lines else path
         raise InputError(f"{type(error).__name__}: {what}", where=where, hint=hint) from error
-
-
-def _suggest(error: BaseException) -> str:
-    """``did you mean 'Lookup'?`` for a name that a module, an object or a file does not have."""
-    name, known = getattr(error, "name", None) or "", dir(getattr(error, "obj", None))
-    if isinstance(error, ImportError):
-        # Python 3.12 has it as `name_from`.
-        found = re.search(r"cannot import name '(\w+)'", str(error))
-        name, known = found[1] if found else "", dir(sys.modules.get(name))
-    elif isinstance(error, NameError):
-        frame = list(walk_tb(error.__traceback__))[-1][0]
-        known = [*frame.f_locals, *frame.f_globals, *dir(builtins)]
-    return suggest_name(name, known)
 
 
 def operations_of(name: str, lattice: Lattice, network: NetworkSection) -> list[Operation]:

@@ -181,15 +181,13 @@ class Objective:
 
     Parameters
     ----------
-    training : TrainingSection
-        Terms, their weights, correction and Huber threshold.
-    noise : NoiseModel
-        Model of the data's noise; its scale, the typical value of the data in 1/sr, is the unit of all terms.
+    training : terms, their weights, correction and Huber threshold
+    noise : model of the data's noise; its scale, the typical value of the data in 1/sr, is the unit of all
+        terms
 
     Attributes
     ----------
-    fraction : float
-        Fraction of the training that is spent; by default 1, so that all terms count.
+    fraction : fraction of the training that is spent; by default 1, so that all terms count
     """
 
     def __init__(self, training: TrainingSection, noise: NoiseModel) -> None:

@@ -28,7 +28,6 @@ from typing import (
     Generic,
     Literal,
     TypeVar,
-    cast,
     get_args,
     get_origin,
     get_type_hints,
@@ -61,27 +60,8 @@ _REFERENCE = re.compile(r"(\w+)(?:\[(\d+):(\d+)\])?")
 V = TypeVar("V")
 
 
-class _Checked(type):
-    """Refuses wrong arguments with the signature of the operation."""
-
-    def __call__(cls, *given: Any, **named: Any) -> Any:
-        operation = cast("type[Operation]", cls)
-        signature = inspect.signature(operation.__init__)
-        try:
-            found = signature.bind(None, *given, **named).arguments
-            for name in _lists_of(operation.kind()):
-                if isinstance(found[name], str):
-                    raise TypeError(f"'{name}' is one name, not several: ('{found[name]}',)")
-        except TypeError as error:
-            known = list(signature.parameters)
-            hint = next((suggest_name(name, known) for name in named if name not in known), "")
-            text = f"{error}; {hint and f'{hint} '}the arguments are {operation.signature()}"
-            raise TypeError(text) from None
-        return super().__call__(*given, **named)
-
-
 @dataclass(frozen=True)
-class Operation(metaclass=_Checked):
+class Operation:
     """One step of a model.
 
     Attributes
@@ -98,8 +78,12 @@ class Operation(metaclass=_Checked):
         """
         Raises
         ------
+        TypeError : a field is one name, not several
         ValueError : a field is none of the names that it may be
         """
+        for name in _lists_of(self.kind()):
+            if isinstance(one := getattr(self, name), str):
+                raise TypeError(f"{self.kind()}: '{name}' is one name, not several: ('{one}',)")
         for name, choices in _choices_of(self.kind()).items():
             if (given := getattr(self, name)) not in choices:
                 hint = suggest_name(str(given), choices)

@@ -93,14 +93,10 @@ def forecast_error(loop: TrainingLoop, queries: ShardQueries, step: Estimate, st
 
     Parameters
     ----------
-    loop : TrainingLoop
-        Of one material, at its first step; left in another state.
-    queries : ShardQueries
-        Validation subset.
-    step : Estimate
-        Seconds of a training step.
-    steps : int
-        Steps of the fit.
+    loop : of one material, at its first step; left in another state
+    queries : validation subset
+    step : seconds of a training step
+    steps : steps of the fit
 
     Returns
     -------

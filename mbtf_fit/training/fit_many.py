@@ -72,14 +72,10 @@ def fit_many(
 
     Parameters
     ----------
-    configs, shards, folders : sequence
-        Configuration, data set and material of each fit.
-    runner : Runner
-        Of other processes: each fit has one of its own, or a worker.
-    overwrite : bool
-        Replace fits of other configurations.
-    finished : callable
-        Called with the folder of each fit as it ends, and its error.
+    configs, shards, folders : configuration, data set and material of each fit
+    runner : of other processes: each fit has one of its own, or a worker
+    overwrite : replace fits of other configurations
+    finished : called with the folder of each fit as it ends, and its error
 
     Returns
     -------
@@ -89,8 +85,7 @@ def fit_many(
 
     Raises
     ------
-    PartialError
-        The workers cannot be reached any more; finished fits and checkpoints are kept.
+    PartialError : the workers cannot be reached any more; finished fits and checkpoints are kept
     """
     items = [
         Item(

@@ -88,20 +88,9 @@ def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForec
 
     Takes a tenth to a half of the fit's steps, see :mod:`~mbtf_fit.training.error_forecast`.
 
-    Parameters
-    ----------
-    config : FitConfig
-    shards : str, Path or DataFolder
-        Data set.
-
-    Returns
-    -------
-    FitForecast
-
     Raises
     ------
-    InputError
-        The data set cannot be read, or suits another model.
+    InputError : the data set cannot be read, or suits another model
     """
     began = time.perf_counter()
     data = open_data(shards, config.model, config.data.cache)

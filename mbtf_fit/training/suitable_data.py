@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.folder import DataFolder
-from mbtf_core.data.schema import CONFIG_NAME, Layout
 from mbtf_core.errors import InputError
 from mbtf_fit.models.registry import model_class
-
-# Fewest queries per texel, whole images or slices of all texels, from which a fit is worthwhile.
-_FEWEST_PER_TEXEL = 20
 
 
 def open_data(folder: str | Path | DataFolder, model: str, cache: float | None = None) -> Dataset:
@@ -27,7 +22,7 @@ def open_data(folder: str | Path | DataFolder, model: str, cache: float | None =
         raise InputError(
             f"the data set has the {data.layout} layout, but {model} needs the {needs.layout} layout",
             where=data.folder,
-            hint=f"generate them: {_generated_again(data, needs.layout, model)}"
+            hint=f"generate them: mbtf-gen ... --layout {needs.layout}"
             if data.estimates == 2
             else "measured data have no other layout; choose another model: --model neumip+",
         )
@@ -40,16 +35,3 @@ def open_data(folder: str | Path | DataFolder, model: str, cache: float | None =
             hint=f"fit another model: --model {'neumip+' if record is None else 'relief'}",
         )
     return data
-
-
-def _generated_again(data: Dataset, layout: Layout, model: str) -> str:
-    """The commands that generate a data set again in a layout, and fit a model to it."""
-    material = (data.manifest.get("config") or {}).get("material")
-    if material is None:
-        return f"mbtf-gen ... --layout {layout}"
-    folder = f"{data.folder}-{layout}"
-    words = ["mbtf-gen", material, "--config", data.folder.at(CONFIG_NAME), "--layout", layout]
-    if data.manifest["splits"]["train"].get("queries", 0) < _FEWEST_PER_TEXEL * data.lattice.texels():
-        words += ["--queries", "100/texel"]
-    fit = shlex.join(["mbtf-fit", folder, "--model", model])
-    return f"{shlex.join([*words, '-o', folder])} && {fit}"

@@ -141,10 +141,13 @@ def read_shape(path: Path) -> tuple[dict[str, F64], NDArray[np.int64], float]:
             f"has {len(faces):,} triangles, more than {MOST_TRIANGLES:,}", where=path, hint="simplify it"
         )
     uv = np.nan_to_num(uv)
+    import trimesh
+
     # Vertices of a part at one position and one place of the texture share their frame.
     part = np.repeat(np.arange(len(shapes)), counts)
-    _, same = np.unique(np.column_stack([vertices, uv, part]), axis=0, return_inverse=True)
-    smooth = np.split(_normals(vertices, faces, same), np.cumsum(counts[:-1]))
+    places, same = np.unique(np.column_stack([vertices, uv, part]), axis=0, return_inverse=True)
+    welded = trimesh.Trimesh(places[:, :3], same[faces], process=False)
+    smooth = np.split(welded.vertex_normals[same], np.cumsum(counts[:-1]))
     given = [shape.normals for shape in shapes]
     normals = np.concatenate([n if own is None else own for own, n in zip(given, smooth, strict=True)])
     center = (vertices.min(0) + vertices.max(0)) / 2
@@ -163,18 +166,6 @@ def read_shape(path: Path) -> tuple[dict[str, F64], NDArray[np.int64], float]:
         "uvs": uv,
     }
     return arrays, faces, unit
-
-
-def _normals(vertices: F64, faces: NDArray[np.int64], same: NDArray[np.int64]) -> F64:
-    """Means (n, 3) of the triangles' normals over vertices of the `same` number, weighted by angles."""
-    corners = vertices[faces]
-    normal = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), 0.0)
-    sums = np.zeros_like(vertices)
-    for k in range(3):
-        a, b = (_unit(corners[:, (k + by) % 3] - corners[:, k], 0.0) for by in (1, 2))
-        angle = np.arccos(np.clip((a * b).sum(axis=1), -1.0, 1.0))
-        np.add.at(sums, same[faces[:, k]], normal * angle[:, None])
-    return _unit(sums)[same]
 
 
 def _unit(vectors: F64, otherwise: ArrayLike = (0.0, 0.0, 1.0)) -> F64:

@@ -22,6 +22,7 @@ from mbtf_fit.backends.shader.program import TRANSMITTANCE, program_of
 from mbtf_fit.backends.shader.syntax import GLSL
 from mbtf_fit.material.format import DEFAULT_MIN_COS, QUERY
 from mbtf_fit.material.material import Material, conformance_values
+from mbtf_fit.material.rounding import RoundingError
 from mbtf_fit.ops.constants import MAX_ANISOTROPY
 from mbtf_fit.viewer.textures import F32, PackedTexture, pack
 
@@ -166,17 +167,6 @@ def as_read(material: Material, packed: dict[str, PackedTexture]) -> Material:
     )
 
 
-def _rounding(material: Material, read: Material, bits: int) -> str:
-    """Error of a page's textures on the conformance queries, in words."""
-    exact = material.conformance["rgb"].astype(np.float64)
-    difference = read.conformance["rgb"].astype(np.float64) - exact
-    rms, power = float(np.sqrt((difference**2).mean())), float(np.sqrt((exact**2).mean()))
-    return (
-        f"textures of {bits} bits: rms error {rms:.2g} 1/sr ({rms / power if power else 0.0:.2g} of the rms "
-        f"value), largest {float(np.abs(difference).max()):.2g} 1/sr"
-    )
-
-
 def content_of(material: Material, name: str, packed: dict[str, PackedTexture]) -> dict[str, Any]:
     """What a page holds of a material with these textures, as JSON.
 
@@ -235,4 +225,5 @@ def material_content(folder: Path, name: str | None = None) -> tuple[dict[str, A
     material = Material.load(folder)
     packed, bits = _fitting(material)
     content = content_of(material, name or real_path(folder).name, packed)
-    return content, _rounding(material, as_read(material, packed), bits)
+    after = as_read(material, packed).conformance["rgb"]
+    return content, str(RoundingError.between(f"textures of {bits} bits", material.conformance["rgb"], after))

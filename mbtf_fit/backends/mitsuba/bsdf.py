@@ -10,12 +10,14 @@ import logging
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any, Literal
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from pydantic import BeforeValidator, Field, PositiveFloat
 
+from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.pictures import pixel_sigma
 from mbtf_fit.backends.mitsuba.backend import Arithmetic
@@ -23,8 +25,7 @@ from mbtf_fit.backends.mitsuba.curvature import curvature, in_axes, rounded, wit
 from mbtf_fit.backends.mitsuba.evaluator import Evaluator, Values
 from mbtf_fit.backends.mitsuba.frame import Frame
 from mbtf_fit.backends.mitsuba.mixture import Mixture
-from mbtf_fit.backends.mitsuba.names import BSDF_NAME, footprints_provided, refuse_unknown
-from mbtf_fit.backends.mitsuba.partials import FootprintRequest, uv_partials
+from mbtf_fit.backends.mitsuba.names import BSDF_NAME, footprints_provided, options_of
 from mbtf_fit.backends.mitsuba.shade import DirectLight
 from mbtf_fit.backends.mitsuba.shell import ShellHit, clamped
 from mbtf_fit.backends.mitsuba.stored_material import StoredMaterial, read_material
@@ -49,11 +50,29 @@ TOLERANCE = {"unrolled": 1e-4, "cooperative": 1e-4, "half": 1e-2}
 # One conformance query of so many may deviate where view rays are traced.
 MISSED_EDGES = 100
 
-PARAMETERS = ("material", "uv_scale", "sigma", "networks", "sampling", "silhouettes", "two_sided")
-
 _log = logging.getLogger(__name__)
 # Materials with a warning of missing footprints.
 _warned: set[Path] = set()
+
+
+def _pair(value: Any) -> Any:
+    """A number for u and v, or one for each, separated by a comma."""
+    parts = value.split(",") if isinstance(value, str) else [value]
+    return parts if len(parts) > 2 else (parts[0], parts[-1])
+
+
+class MaterialOptions(Settings):
+    """Parameters of :class:`MbtfBSDF`."""
+
+    material: FileName
+    uv_scale: Annotated[tuple[PositiveFloat, PositiveFloat], BeforeValidator(_pair)] = Field(
+        "1", validate_default=True
+    )
+    sigma: PositiveFloat | None = None
+    networks: Arithmetic | None = None
+    sampling: Literal["network", "cosine"] = "network"
+    silhouettes: bool = False
+    two_sided: bool = False
 
 
 class MbtfBSDF(mi.BSDF):
@@ -80,32 +99,26 @@ class MbtfBSDF(mi.BSDF):
     def __init__(self, props: Properties) -> None:
         # Errors must precede the registration of the instance: one that an exception's traceback keeps alive
         # would be called by every later render.
-        if "material" not in props:
-            raise UsageError("names no material", where=self._name(props), hint="add: 'material': 'folder/'")
-        refuse_unknown(props, PARAMETERS, self._name(props))
-        folder = Path(str(mi.file_resolver().resolve(str(props["material"]))))
+        name = f"{BSDF_NAME} '{props.id()}'" if props.id() else BSDF_NAME
+        options = options_of(props, MaterialOptions, name)
+        folder = Path(str(mi.file_resolver().resolve(options.material)))
         stored = read_material(folder)
         self.lattice = stored.lattice
         self.min_cos = dr.opaque(mi.Float, stored.min_cos)
-        networks = self._choice(props, "networks", get_args(Arithmetic))
-        self.evaluator = Evaluator(stored, networks)
+        self.evaluator = Evaluator(stored, options.networks)
         _check_conformance(self.evaluator, stored)
-        self.by_network = self._choice(props, "sampling", ("network", "cosine")) != "cosine"
-        silhouettes, self.two_sided = self._switch(props, "silhouettes"), self._switch(props, "two_sided")
-        if silhouettes and self.two_sided:
+        self.by_network, self.two_sided = options.sampling == "network", options.two_sided
+        if options.silhouettes and self.two_sided:
             hint = "silhouettes trace the front alone: leave one of them out"
-            raise UsageError("has both silhouettes and two_sided", where=self._name(props), hint=hint)
-        self.shell = self.evaluator.shell if silhouettes else None
-        if silhouettes and self.shell is None:
-            raise UsageError(
-                "has silhouettes, but its material knows no heights",
-                where=self._name(props),
-                hint="fit the model relief, or leave silhouettes out",
-            )
-        self.uv_scale = self._pair(props, "uv_scale")
-        self.sigma_given = "sigma" in props
-        self.sigma = self._positive(props, "sigma", stored.lattice.sigma_range[0])
-        self.folder, self.request = folder, FootprintRequest()
+            raise UsageError("has both silhouettes and two_sided", where=name, hint=hint)
+        self.shell = self.evaluator.shell if options.silhouettes else None
+        if options.silhouettes and self.shell is None:
+            hint = "fit the model relief, or leave silhouettes out"
+            raise UsageError("has silhouettes, but its material knows no heights", where=name, hint=hint)
+        self.uv_scale = mi.Point2f(*(dr.opaque(mi.Float, number) for number in options.uv_scale))
+        self.sigma_given = options.sigma is not None
+        self.sigma = dr.opaque(mi.Float, options.sigma or stored.lattice.sigma_range[0])
+        self.folder = folder
         super().__init__(props)
         known = mi.BSDFFlags
         self.m_flags = known.GlossyReflection | known.FrontSide | known.SpatiallyVarying | known.Anisotropic
@@ -118,46 +131,8 @@ class MbtfBSDF(mi.BSDF):
             self.m_components = [self.m_flags, through]
             self.m_flags |= through
 
-    @staticmethod
-    def _name(props: Properties) -> str:
-        return f"{BSDF_NAME} '{props.id()}'" if props.id() else BSDF_NAME
-
-    def _switch(self, props: Properties, name: str) -> bool:
-        value = props.get(name, False)
-        if not isinstance(value, bool):
-            raise UsageError(f"{name} must be true or false, not {value}", where=self._name(props))
-        return value
-
-    def _positive(self, props: Properties, name: str, default: float) -> Any:
-        value = props.get(name, default)
-        if not isinstance(value, (int, float)) or not 0 < value < np.inf:
-            raise UsageError(f"{name} must be a positive number, not {value}", where=self._name(props))
-        return dr.opaque(mi.Float, float(value))
-
-    def _pair(self, props: Properties, name: str) -> Any:
-        """A positive number for u and v (default 1), or one for each, separated by a comma."""
-        value = props.get(name, 1.0)
-        parts = value.split(",") if isinstance(value, str) else [value]
-        try:
-            numbers = [float(part) for part in parts]
-        except (TypeError, ValueError):
-            numbers = []
-        if len(numbers) not in (1, 2) or not all(0 < number < np.inf for number in numbers):
-            what = f"{name} must be a positive number, or two such as 8,4, not {value}"
-            raise UsageError(what, where=self._name(props))
-        return mi.Point2f(*(dr.opaque(mi.Float, number) for number in (numbers[0], numbers[-1])))
-
-    def _choice(self, props: Properties, name: str, choices: tuple[str, ...]) -> Any:
-        value = props.get(name, None)
-        if value is not None and value not in choices:
-            raise UsageError(
-                f"{name} must be one of {', '.join(choices)}, not {value}", where=self._name(props)
-            )
-        return value
-
-    def _warn_once(self, si: SurfaceInteraction3f) -> None:
-        provided = footprints_provided.get() or hasattr(si, "footprint")
-        if provided or self.sigma_given or self.folder in _warned:
+    def _warn_once(self) -> None:
+        if footprints_provided.get() or self.sigma_given or self.folder in _warned:
             return
         _warned.add(self.folder)
         _log.warning(
@@ -168,8 +143,9 @@ class MbtfBSDF(mi.BSDF):
 
     def footprint(self, si: SurfaceInteraction3f) -> Float:
         """σ at hits in tile widths, from the area of a pixel on the surface."""
-        dx, dy = uv_partials(si)
-        area = dr.abs(dx.x * dy.y - dx.y * dy.x) * self.uv_scale.x * self.uv_scale.y
+        area = (
+            dr.abs(si.duv_dx.x * si.duv_dy.y - si.duv_dx.y * si.duv_dy.x) * self.uv_scale.x * self.uv_scale.y
+        )
         return dr.select(area > 0, pixel_sigma(area), self.sigma)
 
     def uv(self, si: SurfaceInteraction3f) -> Point2f:
@@ -177,7 +153,7 @@ class MbtfBSDF(mi.BSDF):
         return mi.Point2f(self.uv_scale.x * si.uv.x, 1.0 - self.uv_scale.y * si.uv.y / self.lattice.aspect)
 
     def _view(self, si: SurfaceInteraction3f) -> View:
-        self._warn_once(si)
+        self._warn_once()
         frame, u = Frame.at(si, self.two_sided, self.uv_scale), self.uv(si)
         level = self.evaluator.level(self.footprint(si))
         wi = frame.to_tile(si.wi)
@@ -251,9 +227,6 @@ class MbtfBSDF(mi.BSDF):
         callback.put("sigma", self.sigma, mi.ParamFlags.NonDifferentiable)
         for name, textures in self.evaluator.textures.items():
             callback.put(name.replace(".", "_"), textures.buffer, mi.ParamFlags.Differentiable)
-        if hasattr(mi.Texture, "filtered"):
-            # Found by the scene, which then computes footprints.
-            callback.put("footprint", self.request, mi.ParamFlags.NonDifferentiable)
 
     def to_string(self) -> str:
         """Text that Mitsuba prints."""

@@ -3,8 +3,8 @@
 A cone has a width, the side of the square that a pixel covers across the ray, and a spread, by which the
 width grows per unit of length (Amanatides 1984; Akenine-Möller et al. 2019). The initial values are the
 sensor's ray differentials of whole pixels. At a hit its footprint is the projection of the square
-onto the surface, as it is from Mitsuba 3.10 on where camera rays of its own integrators hit. The curvature of
-surfaces is neglected. The spread of a scattered ray's cone is bounded below by the density of its direction.
+onto the surface, whose curvature is neglected. The spread of a scattered ray's cone is bounded below by the
+density of its direction.
 
 At grazing angles a pixel's footprint is an ellipse, while those of materials are round. An elongated Gaussian
 is the mean of narrow ones along its major axis, so every hit on a surface's material looks up one of them at
@@ -17,13 +17,13 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+from pydantic import Field
 
-from mbtf_core.errors import UsageError
+from mbtf_core.config.settings import Settings
 from mbtf_core.pictures import PIXEL_SIGMA
 from mbtf_fit.backends.mitsuba.bsdf import MbtfBSDF, check_scene
 from mbtf_fit.backends.mitsuba.curvature import with_normal_partials
-from mbtf_fit.backends.mitsuba.names import INTEGRATOR_NAME, footprints_provided, refuse_unknown
-from mbtf_fit.backends.mitsuba.partials import set_uv_partials, uv_partials
+from mbtf_fit.backends.mitsuba.names import INTEGRATOR_NAME, footprints_provided, options_of
 from mbtf_fit.ops.constants import MAX_ANISOTROPY
 from mbtf_gen.engine.types import (
     DirectionSample3f,
@@ -63,7 +63,7 @@ def write_footprint(si: SurfaceInteraction3f, ray: Ray3f, width: Float) -> Surfa
         a, b = dr.dot(si.dp_du, step), dr.dot(si.dp_dv, step)
         return mi.Vector2f((g * a - f * b) * inverse, (e * b - f * a) * inverse)
 
-    set_uv_partials(si, partials(along), partials(beside))
+    si.duv_dx, si.duv_dy = partials(along), partials(beside)
     return si
 
 
@@ -79,7 +79,7 @@ def narrow_footprint(
     most : largest ratio of the radii; of more elongated footprints the minor radius is enlarged
     active : hits to change
     """
-    dx, dy = uv_partials(si)
+    dx, dy = si.duv_dx, si.duv_dy
     # Squared semi-axes of the image of the unit circle, and the direction of the major one.
     xx, xy, yy = (
         dr.square(dx.x) + dr.square(dy.x),
@@ -95,8 +95,8 @@ def narrow_footprint(
     step = PIXEL_SIGMA * dr.sqrt(dr.maximum(major - minor, 0.0)) * normal
     si, side = type(si)(si), dr.sqrt(minor)
     si.uv[active] = si.uv + step * mi.Vector2f(cos, sin)
-    narrow = mi.Vector2f(side, 0.0), mi.Vector2f(0.0, side)
-    set_uv_partials(si, dr.select(active, narrow[0], dx), dr.select(active, narrow[1], dy))
+    si.duv_dx = dr.select(active, mi.Vector2f(side, 0.0), dx)
+    si.duv_dy = dr.select(active, mi.Vector2f(0.0, side), dy)
     return si
 
 
@@ -108,23 +108,24 @@ def camera_cone(ray: Ray3f, samples: int) -> tuple[Float, Float]:
     return tuple(scale * dr.sqrt(dr.abs(dr.dot(area, ray.d))) for area in (width, spread))
 
 
-def materials_of(scene: Scene) -> list[Any]:
-    """The ``mbtf`` materials of a scene's surfaces, each once; not those inside other BSDFs or instances."""
-    found = {id(bsdf): bsdf for bsdf in (s.bsdf() for s in scene.shapes()) if isinstance(bsdf, MbtfBSDF)}
-    return [*found.values()]
-
-
-def may_transmit(scene: Scene) -> bool:
-    """Whether a surface of the scene may transmit light without refraction; True if unknown."""
+def surfaces_of(scene: Scene) -> tuple[bool, bool, list[Any]]:
+    """Whether a surface of a scene may transmit light without refraction, and whether one may trace heights
+    over its curvature, both True if unknown; and the ``mbtf`` materials, each once, without those inside
+    other BSDFs or instances."""
     surfaces = [shape.bsdf() for shape in scene.shapes()]
-    return any(bsdf is None or mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in surfaces)
+    materials = [*{id(bsdf): bsdf for bsdf in surfaces if isinstance(bsdf, MbtfBSDF)}.values()]
+    passing = [b for b in surfaces if b is None or mi.has_flag(b.flags(), mi.BSDFFlags.Null)]
+    unknown = any(not isinstance(bsdf, MbtfBSDF) for bsdf in passing)
+    return bool(passing), unknown or any(m.shell is not None for m in materials), materials
 
 
-def may_curve(scene: Scene) -> bool:
-    """Whether a surface of the scene may trace heights over its curvature; True if unknown."""
-    others = [b for b in (s.bsdf() for s in scene.shapes()) if not isinstance(b, MbtfBSDF)]
-    unknown = any(b is None or mi.has_flag(b.flags(), mi.BSDFFlags.Null) for b in others)
-    return unknown or any(material.shell is not None for material in materials_of(scene))
+class PathOptions(Settings):
+    """Parameters of :class:`ConePath`."""
+
+    max_depth: int = Field(-1, ge=-1)
+    rr_depth: int = Field(5, ge=1)
+    hide_emitters: bool = False
+    max_anisotropy: float = Field(MAX_ANISOTROPY, ge=1, le=1024)
 
 
 class ConePath(mi.SamplingIntegrator):
@@ -141,17 +142,11 @@ class ConePath(mi.SamplingIntegrator):
 
     def __init__(self, props: Properties) -> None:
         super().__init__(props)
-        depth = int(props.get("max_depth", -1))
-        self.max_depth = 0xFFFFFFFF if depth < 0 else depth
-        self.rr_depth = int(props.get("rr_depth", 5))
-        if depth < -1 or self.rr_depth < 1:
-            raise UsageError("max_depth must be at least -1, rr_depth at least 1", where=INTEGRATOR_NAME)
-        self.hidden = bool(props.get("hide_emitters", False))
-        most = float(props.get("max_anisotropy", MAX_ANISOTROPY))
-        self.round, self.anisotropy = most == 1.0, dr.opaque(mi.Float, most)
-        if not 1.0 <= most <= 1024.0:
-            raise UsageError("max_anisotropy must be between 1 and 1024", where=INTEGRATOR_NAME)
-        refuse_unknown(props, ("max_depth", "rr_depth", "hide_emitters", "max_anisotropy"), INTEGRATOR_NAME)
+        options = options_of(props, PathOptions, INTEGRATOR_NAME)
+        self.max_depth = 0xFFFFFFFF if options.max_depth < 0 else options.max_depth
+        self.rr_depth, self.hidden = options.rr_depth, options.hide_emitters
+        self.round = options.max_anisotropy == 1.0
+        self.anisotropy = dr.opaque(mi.Float, options.max_anisotropy)
 
     def render(self, scene: Scene, *arguments: Any, **options: Any) -> Any:
         """Render after a check of the scene.
@@ -171,8 +166,8 @@ class ConePath(mi.SamplingIntegrator):
         token = footprints_provided.set(True)
         try:
             cone = (mi.Ray3f(ray), width, spread)
-            materials = [] if self.round else materials_of(scene)
-            known = (may_transmit(scene), may_curve(scene), materials)
+            transmits, curved, materials = surfaces_of(scene)
+            known = (transmits, curved, [] if self.round else materials)
             return *self._trace(scene, sampler, *cone, mi.Bool(active), *known), []
         finally:
             footprints_provided.reset(token)

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextvars import ContextVar
+from typing import TypeVar
 
+from mbtf_core.config.settings import Settings, build
 from mbtf_core.errors import UsageError
-from mbtf_core.paths import suggest_name
 from mbtf_gen.engine.runtime import CPU_VARIANT, CUDA_VARIANT
 from mbtf_gen.engine.types import Properties
 
 BSDF_NAME = "mbtf"
 INTEGRATOR_NAME = "mbtf_path"
+S = TypeVar("S", bound=Settings)
 VARIANTS = (CPU_VARIANT, CUDA_VARIANT)
 
 # Whether the integrator that is tracing provides footprints to the BSDFs.
 footprints_provided: ContextVar[bool] = ContextVar("footprints_provided", default=False)
 
 
-def refuse_unknown(props: Properties, known: Sequence[str], where: str) -> None:
-    """Refuse a parameter that a plugin does not have, in one line; Mitsuba's own report has several.
+def options_of(props: Properties, model: type[S], where: str) -> S:
+    """The parameters of a plugin; Mitsuba's own report of a wrong one has several lines.
 
     Raises
     ------
-    UsageError : there is one
+    UsageError : one is unknown, missing or wrong
     """
-    unknown = sorted(set(props.unqueried()) - set(known))
-    if unknown:
-        hint = suggest_name(unknown[0], known) or f"it has: {', '.join(known)}"
-        raise UsageError(f"has no parameter '{unknown[0]}'", where=where, hint=hint)
+    given = {name: props[name] for name in (*props.unqueried(), *model.model_fields) if name in props}
+    return build(model, given, source=where, error=UsageError)

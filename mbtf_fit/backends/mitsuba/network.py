@@ -50,15 +50,13 @@ def _network(op: ops.Network, loader: Loader) -> Step:
         layers.append((take(f"{name}.weight", (outputs, inputs)), take(f"{name}.bias", (outputs,))))
     # Single precision for small networks that move lookups: values are sensitive to errors of the position.
     small = sum(weight.size + bias.size for weight, bias in layers) <= MOST_UNROLLED
-    if arithmetic == "half" and small and _moves_lookups(op, loader.stored.operations):
+    operations = loader.stored.operations
+    moved = reached_from(operations, op.output)
+    moves = any(isinstance(o, ops.Lookup) and parse(o.u)[0] in moved for o in operations)
+    if arithmetic == "half" and small and moves:
         arithmetic = "unrolled"
     network = PackedNetwork(layers, arithmetic, op.activation)
     return lambda x: network([number for value in x for number in value])
-
-
-def _moves_lookups(op: ops.Network, operations: Sequence[ops.Operation]) -> bool:
-    reached = reached_from(operations, op.output)
-    return any(isinstance(o, ops.Lookup) and parse(o.u)[0] in reached for o in operations)
 
 
 class PackedNetwork:

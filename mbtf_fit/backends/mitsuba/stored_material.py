@@ -60,7 +60,7 @@ class StoredMaterial:
 
         Raises
         ------
-        InputError : it is missing, of another shape, or has numbers that are not finite
+        InputError : it is missing or of another shape
         """
         array, path = self.tensors.get(name), self.folder / WEIGHTS_NAME
         if array is None:
@@ -69,10 +69,7 @@ class StoredMaterial:
             s not in (None, t) for s, t in zip(shape, array.shape, strict=True)
         ):
             raise InputError(f"its tensor '{name}' has the shape {array.shape}", where=path)
-        out: F32 = np.array(array, np.float32, order="C")
-        if not np.isfinite(out).all():
-            raise InputError(f"its tensor '{name}' holds numbers that are not finite", where=path)
-        return out
+        return np.array(array, np.float32, order="C")
 
 
 def read_material(folder: str | Path) -> StoredMaterial:

@@ -115,16 +115,12 @@ class Textures:
             (j1 + i0, low_left),
             (j1 + i1, low_right),
         ):
-            texel = self._texel(index) if group is None else self._group(index, group)
-            out = [dr.fma(value, weight, total) for value, total in zip(texel, out, strict=True)]
+            groups = range(self.groups) if group is None else [group]
+            texel = [value for k in groups for value in self._group(index, mi.UInt32(k))]
+            # Without the padding of the last group.
+            out = [dr.fma(value, weight, total) for value, total in zip(texel, out, strict=False)]
         return out
 
     def _group(self, index: UInt32, group: UInt32) -> list[Float]:
         texel, after = self._strides
         return list(dr.gather(mi.Vector4f, self.buffer, index * texel + group * after))
-
-    def _texel(self, index: UInt32) -> list[Float]:
-        values: list[Float] = []
-        for group in range(self.groups):
-            values += self._group(index, mi.UInt32(group))
-        return values[: self.channels]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from mbtf_core.app.console import run
 from mbtf_core.errors import InputError
 from mbtf_fit.cli.app import app
 from mbtf_fit.evaluation import score_predictions
-from mbtf_fit.formatting import report_errors, visibility
+from mbtf_fit.formatting import visibility
 
 NOISE, OFFSET = 0.02, 0.01
 
@@ -97,37 +96,3 @@ def test_psnr_has_a_word(mse: float, error: float, text: str, word: str | None) 
     for factor, exposure in ((1, 0.0), (16, -2.0)):
         errors = {"value": factor * mse, "error": factor * error}
         assert visibility({"mse": errors, "exposure": exposure}) == (text, word)
-
-
-def test_an_undefined_error_has_its_psnr_and_its_column() -> None:
-    """Noise hides the variance of test queries; ten of the held-out queries make most of their error."""
-
-    def split(value: float | None, ten_largest: float) -> dict[str, Any]:
-        unexplained = {"value": value, "error": None if value is None else 0.005}
-        more = {"levels": {}, "elevations": {}, "color": {"value": None, "error": None}}
-        mse = {"value": 0.001, "error": 0.002}
-        return (
-            {"n": 5000, "unexplained": unexplained, "mse": mse, "exposure": 0.0}
-            | more
-            | {"ten_largest": ten_largest}
-        )
-
-    found = {"test": split(None, 0.1), "held_out_queries": split(0.009, 0.8), "training": split(0.02, 0.1)}
-    text = "\n".join(report_errors(found, None, verbose=True))
-    assert "PSNR above 23.0 dB of 5000 test queries" in text
-    header = next(line for line in text.splitlines() if line.startswith("unexplained variance"))
-    assert all(name in header for name in ("test queries", "held-out queries", "training queries"))
-    assert "held-out queries unreliable" in text
-    assert "training queries unreliable" not in text
-
-
-@pytest.mark.parametrize(
-    ("value", "share", "said"),
-    [(0.83, 0.15, True), (0.25, 0.15, False), (0.83, 2e-4, False), (None, 0.0, False)],
-)
-def test_colors_that_are_hardly_learned_are_said(value: float | None, share: float, said: bool) -> None:
-    """A cloth in three colors whose green was brown: its unexplained variance was 0.321."""
-    color = {"value": value, "error": None if value is None else 0.005, "share": share}
-    split = {"n": 8192, "unexplained": {"value": 0.321, "error": 0.011}, "color": color}
-    split |= {"mse": {"value": 0.001, "error": 1e-5}, "exposure": 0.0, "ten_largest": 0.1}
-    assert any("colors are hardly learned" in line for line in report_errors({"test": split}, None)) == said

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Mapping
 from itertools import islice
 from pathlib import Path
@@ -10,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from support.datasets import write_dataset
 from support.fit_data import constant, parallax, random_queries, write_data
 from support.image_data import random_images, write_images
 
@@ -19,13 +17,9 @@ from mbtf_core.data.lattice import Lattice, sigma_of_level
 from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig, Material, evaluate, fit
 from mbtf_fit.config import build_model
-from mbtf_fit.data.layouts import Patches, TrainingImages, nearest_shapes, strides
+from mbtf_fit.data.layouts import TrainingImages, nearest_shapes, strides
 from mbtf_fit.data.loader import Partition, in_region, load_training
 from mbtf_fit.sections import HeldOutSection
-from mbtf_fit.training.loop import TrainingLoop
-from mbtf_fit.training.suitable_data import open_data
-from mbtf_fit.training.trainer import BETAS, prepare_trainer
-from mbtf_gen.cli.app import app
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan
 
 HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
@@ -164,25 +158,6 @@ def test_a_hierarchical_material_is_fitted_and_loads_again(tmp_path: Path) -> No
     np.testing.assert_allclose(alone[0], found[500], rtol=1e-4, atol=1e-6)
 
 
-def test_every_weight_gets_its_own_gradient(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Gradients of convolutions have another order in memory than the weights."""
-    monkeypatch.setattr("mbtf_fit.training.trainer.kernel", lambda: None)
-    data = Dataset.open(write_images(tmp_path / "d", parallax, train=8))
-    config = quick(1)
-    trainer = prepare_trainer(config, data, load_training(data, config.held_out, 0), torch.device("cpu"))
-    batch = next(trainer.queries.batches(trainer.batch, 0, 0, trainer.model.margin))
-    assert isinstance(batch, Patches)
-    for texture, table in zip(trainer.model.textures(), trainer._tables(), strict=True):
-        texture.read(table.detach())
-    found = trainer.model.evaluate_patches(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
-    weights = trainer.model.parameter_groups()[1]
-    expected = torch.autograd.grad(trainer.loss(found, batch), weights)
-    TrainingLoop([trainer]).train(60.0)
-    for weight, gradient in zip(weights, expected, strict=True):
-        moment = trainer.optimizer.state[weight]["exp_avg"] / (1 - BETAS[0])
-        assert float((moment - gradient).norm()) <= 1e-3 * float(gradient.norm()) + 1e-9
-
-
 def test_the_other_layout_is_refused_with_a_hint(tmp_path: Path) -> None:
     shuffled = write_data(tmp_path / "s", constant(0.1), train=100)
     with pytest.raises(InputError, match=r"shuffled layout, but hierarchical .*\n.*--layout image"):
@@ -192,17 +167,3 @@ def test_the_other_layout_is_refused_with_a_hint(tmp_path: Path) -> None:
         message = rf"image layout, but {config.model} .*\n.*--layout shuffled"
         with pytest.raises(InputError, match=message):
             fit(config, image, tmp_path / "m")
-
-
-def test_the_hint_generates_what_the_model_needs(tmp_path: Path) -> None:
-    data = write_dataset(tmp_path / "s p", queries={"train": "5/texel", "test": "40", "spp": 8}, seed=3)
-    with pytest.raises(InputError) as refused:
-        open_data(data.folder, "hierarchical")
-    generate, fit_again = refused.value.hint.removeprefix("generate them: ").split(" && ")
-    line = shlex.split(generate)
-    arguments = app.parse_args(line[1:], exit_on_error=False, print_error=False)[1].arguments
-    config = arguments["options"].resolve(material=arguments["material"])
-    assert (config.queries.layout, config.queries.train, config.seed) == ("image", "100/texel", 3)
-    assert config.queries.spp == 8
-    assert Path(config.material).exists()
-    assert shlex.split(fit_again)[1] == str(arguments["output"]) != str(data.folder)

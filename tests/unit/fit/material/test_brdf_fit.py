@@ -76,20 +76,6 @@ def test_the_mean_reflectance_and_the_error(tmp_path: Path) -> None:
     np.testing.assert_allclose(ours / tile_means(material, light, view).mean(0), 1, rtol=0.01)
 
 
-def test_lambert_stays_lambert(tmp_path: Path) -> None:
-    known = asymmetric_maps()
-
-    def lambert(texel: np.ndarray, light: np.ndarray, view: np.ndarray) -> np.ndarray:
-        return known["base"][tuple(texel.T)] / math.pi * light[:, 2:]
-
-    maps = fitted(known_brdf(tmp_path, known["slopes"], lambert), 3)
-    assert maps.dielectric == 0
-    assert (maps.roughness == 1).all()
-    assert (maps.metallic == 0).all()
-    np.testing.assert_allclose(maps.base_color, known["base"], atol=1e-3)
-    np.testing.assert_allclose(maps.slopes, known["slopes"], atol=2e-3)
-
-
 def test_noise_makes_no_lobes(tmp_path: Path) -> None:
     """Networks deviate from their data: a Lambert surface with an error of 20% stays rough and no metal."""
     known, random = asymmetric_maps(), np.random.default_rng(0)

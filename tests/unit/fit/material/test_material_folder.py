@@ -22,11 +22,9 @@ from mbtf_core.errors import InputError
 from mbtf_fit import FitConfig, FitResult, Material, evaluate, fit
 from mbtf_fit.data.loader import load_split, load_training
 from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.evaluation import evaluate_splits, split_errors
-from mbtf_fit.formatting import report_errors
+from mbtf_fit.evaluation import split_errors
 from mbtf_fit.material.material import conformance_queries, export
 from mbtf_fit.models.registry import MODELS
-from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.trainer import prepare_trainer
 
 
@@ -173,36 +171,6 @@ def test_few_queries_that_decide_an_error_are_said(data: Path) -> None:
         assert found is not None
         ten = 10 * (heavy or 1.0)
         assert found["ten_largest"] == pytest.approx(ten / (ten + 0.01 * (n - 10)), rel=1e-3)
-
-
-def test_outliers_of_the_prediction_are_named(data: Path) -> None:
-    """One value of 5.4 for 0.6, at its place; not where the reference is as uncertain as that."""
-    opened = Dataset.open(data)
-    stored = load_split(opened, "test")
-    truth = np.full_like(stored.value_a, 0.6)
-    off = 0.02 * (-1.0) ** np.arange(len(truth), dtype=np.float32)[:, None] * np.ones_like(truth)
-    off[7] = 4.8
-    (u, v), level = stored.u[7], -np.log2(2.0 * stored.sigma[7])
-    light, view = (np.degrees(np.arcsin(w[7, 2])) for w in (stored.omega_i, stored.omega_o))
-    from_where = f"elevations of light {light:.0f}° and view {view:.0f}°"
-    for spread, named in ((0.1, True), (4.0, False)):
-        a, b = truth.copy(), truth.copy()
-        a[7], b[7] = truth[7] + spread, truth[7] - spread
-        found = split_errors(lambda q: truth + off, replace(stored, value_a=a, value_b=b), opened)
-        assert found is not None
-        line = "".join(report_errors({"test": found | {"n": 5000}}, None))
-        for words in ("5.4 predicted for 0.6", f"level {level:.1f}", from_where, f"u ({u:.3f}, {v:.3f})"):
-            assert (words in line) == named
-
-
-def test_a_test_set_whose_single_training_query_is_held_out_has_errors(tmp_path: Path) -> None:
-    opened = Dataset.open(write_data(tmp_path / "d", constant(0.25), train=1))
-    held_out = HeldOutSection(direction=(0.0, 0.0), radius=0.99)
-    partition = load_training(opened, held_out, 0, memory=None)
-    assert len(partition.selection) == 0
-    assert "training" not in evaluate_splits(lambda *q: np.ones((len(q[0]), 3)), opened, partition)
-    with pytest.raises(InputError, match="held out"):
-        load_training(opened, held_out, 0)
 
 
 def test_evaluation_refuses_a_tile_of_another_shape(fitted: FitResult, tmp_path: Path) -> None:

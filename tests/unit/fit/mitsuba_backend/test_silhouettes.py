@@ -214,14 +214,6 @@ def test_sharp_edges_are_rounded(scale: str, tmp_path: Path) -> None:
         assert 0.001 < 0.1 * np.abs(np.linalg.eigvalsh(curved)).max() < 0.501
 
 
-def test_curvatures_of_sharp_edges_keep_their_ratio(tmp_path: Path) -> None:
-    shell = mi.load_dict(sunken(tmp_path, 0.1)).shell
-    u, view, sharp = mi.Point2f(0.5, 0.5), mi.Vector3f(0.6, 0.0, 0.8), mi.Vector3f(100.0, 30.0, -80.0)
-    found = np.array(shell.meet(u, mi.Float(3.0), view, sharp, mi.Float(0.05), lambda _: view).curvature)
-    xx, xy, yy = found.ravel()
-    assert 0.1 < 0.1 * np.abs(np.linalg.eigvalsh([[xx, xy], [xy, yy]])).max() < 0.5
-
-
 def test_the_shadow_is_that_of_the_heights(tmp_path: Path) -> None:
     """Of the cylinder inside, on a wall."""
     chart, turned = Chart("cylinder", 6, 1.0), mi.ScalarTransform4f()
@@ -317,8 +309,8 @@ def test_a_material_without_heights_has_no_silhouettes(tmp_path: Path) -> None:
     write_material(tmp_path, model="neumip", finest=2)
     with pytest.raises(UsageError, match="knows no heights"):
         load_scene({"type": "mbtf", "material": str(tmp_path), "silhouettes": True})
-    with pytest.raises(UsageError, match="true or false"):
-        load_scene({"type": "mbtf", "material": str(tmp_path), "silhouettes": "false"})
+    with pytest.raises(UsageError, match="must be a valid boolean"):
+        load_scene({"type": "mbtf", "material": str(tmp_path), "silhouettes": "some"})
     with pytest.raises(UsageError, match="both silhouettes and two_sided"):
         load_scene({"type": "mbtf", "material": str(tmp_path), "silhouettes": True, "two_sided": True})
 

@@ -152,28 +152,6 @@ def test_an_operation_of_pytorch_alone_is_refused(tmp_path: Path) -> None:
     assert "mbtf-fit evaluate" in caught.value.hint
 
 
-@pytest.mark.parametrize(
-    ("operation", "changes", "fault"),
-    [
-        ("network", {"hidden": [24, 25, 25]}, "has the shape"),
-        ("lookup", {"channels": 6}, "has the shape"),
-        ("network", {"x": ["nothing"]}, "'nothing', which is not computed"),
-        ("lookup", {"operation": "guess"}, "is unknown: 'guess'"),
-    ],
-)
-def test_operations_without_their_tensors_are_refused(
-    operation: str, changes: dict[str, Any], fault: str, tmp_path: Path
-) -> None:
-    write_material(tmp_path)
-    path = tmp_path / "material.json"
-    description = json.loads(path.read_text())
-    next(op for op in description["operations"] if op["operation"] == operation).update(changes)
-    path.write_text(json.dumps(description))
-    with pytest.raises(InputError, match=fault) as caught:
-        Evaluator(read_material(tmp_path))
-    check_message(caught.value)
-
-
 @pytest.mark.parametrize("wide", range(4))
 def test_one_lane_stands_for_all(wide: int, tmp_path: Path) -> None:
     """Position, level, view or light alone has many lanes: a schedule of several sizes ends the process."""
@@ -215,47 +193,37 @@ def test_the_plugin_has_the_mixtures_of_pytorch(model: str, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(
-    ("changes", "tensors", "fault"),
+    ("options", "place", "changes", "fault"),
     [
-        ({"x": ["omega_i"]}, {}, "is not that of its operations"),
-        ({"outputs": 5}, {}, "is not that of its operations"),
-        ({"weights": "decoder"}, {}, "is not that of its operations"),
-        ({"operation": "guess"}, {}, "is unknown: 'guess'"),
-        ({}, {"sampler.1.bias": None}, "does not fit the sampler"),
+        ({}, "network", {"hidden": [24, 25, 25]}, "has the shape"),
+        ({}, "lookup", {"channels": 6}, "has the shape"),
+        ({"sampled": True}, "sampler", {"x": ["omega_i"]}, "is not that of its operations"),
+        ({"sampled": True}, "sampler.1.bias", None, "sampler.1.bias"),
+        ({"model": "relief"}, "surface.heights", lambda a: a[:0], "is empty"),
+        ({"model": "relief"}, "surface.heights", lambda a: a + 0.01, "has heights above the reference plane"),
+        ({"model": "relief"}, "surface.maps.3", None, "lacks the tensor 'surface.maps.3'"),
+        ({"model": "relief"}, "surface.maps.0", lambda a: a[..., :9], "have 9 channels in place of 8, 10"),
+        ({"model": "relief"}, "surface.dielectric", lambda a: a[None], "has the shape (1,)"),
     ],
 )
-def test_samplers_that_do_not_fit_are_refused(
-    changes: dict[str, Any], tensors: dict[str, None], fault: str, tmp_path: Path
+def test_operations_and_tensors_that_do_not_fit_are_refused(
+    options: dict[str, Any], place: str, changes: Any, fault: str, tmp_path: Path
 ) -> None:
-    assert write_material(tmp_path, sampled=True).sampler is not None
-    replace_tensors(tmp_path, dict(tensors))
+    """Changed fields of an operation or of the sampler's network; a tensor that is changed or missing. What
+    no reader takes is that of test_fuzz_fits.py."""
+    write_material(tmp_path, **options)
     path = tmp_path / "material.json"
     description = json.loads(path.read_text())
-    description["sampler"][-1].update(changes)
-    path.write_text(json.dumps(description))
-    with pytest.raises(InputError, match=fault) as caught:
-        Material.load(tmp_path)
-    check_message(caught.value)
-    with pytest.raises(InputError) as caught:
-        Evaluator(read_material(tmp_path))
-    check_message(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("name", "change", "fault"),
-    [
-        ("surface.heights", lambda a: a[:0], "is empty"),
-        ("surface.heights", lambda a: a + 0.01, "has heights above the reference plane"),
-        ("surface.heights", lambda a: np.where(a == a.min(), np.nan, a), "not finite"),
-        ("surface.maps.3", None, "lacks the tensor 'surface.maps.3'"),
-        ("surface.maps.0", lambda a: a[..., :9], "have 9 channels in place of 8, 10 or 12"),
-        ("surface.dielectric", lambda a: a[None], "has the shape (1,)"),
-    ],
-)
-def test_corrupt_surfaces_are_refused(name: str, change: Any, fault: str, tmp_path: Path) -> None:
-    write_material(tmp_path, model="relief")
-    tensor = load_file(tmp_path / "weights.safetensors")[name]
-    replace_tensors(tmp_path, {name: None if change is None else change(tensor)})
-    with pytest.raises(InputError, match=re.escape(fault)) as caught:
-        Evaluator(read_material(tmp_path))
-    check_message(caught.value)
+    if isinstance(changes, dict):
+        key, kind = ("sampler", "network") if place == "sampler" else ("operations", place)
+        next(op for op in description[key] if op["operation"] == kind).update(changes)
+        path.write_text(json.dumps(description))
+    else:
+        tensor = load_file(tmp_path / "weights.safetensors")[place]
+        replace_tensors(tmp_path, {place: None if changes is None else changes(tensor)})
+    readers = [lambda: Evaluator(read_material(tmp_path))]
+    readers += [lambda: Material.load(tmp_path)] if "sampled" in options else []
+    for read in readers:
+        with pytest.raises(InputError, match=re.escape(fault)) as caught:
+            read()
+        check_message(caught.value)

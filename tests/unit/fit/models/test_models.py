@@ -11,7 +11,7 @@ from mbtf_core.config.settings import resolve
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import UsageError
 from mbtf_fit.config import FitConfig, build_model
-from mbtf_fit.ops import Lookup, Offset, read_operations
+from mbtf_fit.ops import Lookup, Offset
 from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.sections import OutputTransform
 
@@ -191,20 +191,6 @@ def test_the_tile_repeats(variant: str) -> None:
     torch.testing.assert_close(model(left, *rest), model(right, *rest), rtol=1e-4, atol=1e-6)
 
 
-@variants
-def test_exported_weights_make_the_same_model(variant: str) -> None:
-    model = random_model(variant)
-    for texture in model.textures():
-        texture.read(texture.blurred(1.5))
-    other = random_model(variant)
-    with torch.no_grad():
-        for p in other.parameters():
-            p.zero_()
-    other.load_weights(model.weights())
-    at = arguments(20)
-    torch.testing.assert_close(other(*at), model(*at), rtol=0, atol=0)
-
-
 @pytest.mark.parametrize("output", get_args(OutputTransform))
 def test_training_starts_from_the_datas_brightness(output: Any) -> None:
     model = build_model("neumip", LATTICE, output_transform=output).requires_grad_(False)
@@ -276,15 +262,6 @@ def test_initial_parameters_have_the_stated_distributions(variant: str) -> None:
                 variance = float(tensor.double().square().mean()) * tensor[0].numel()
                 # Of so many numbers, to four standard errors.
                 assert variance == pytest.approx(1 if last else 2, rel=4 * (2 / tensor.numel()) ** 0.5), key
-
-
-@variants
-def test_the_operations_name_what_the_export_holds(variant: str) -> None:
-    model = random_model(variant)
-    kinds = ("tensor", "texture", "network")
-    named = {name for op in model.stored_operations() for kind in kinds for name in op.named(kind)}
-    assert {key.split(".")[0] for key in model.weights()} == named
-    assert read_operations([op.as_json() for op in model.operations]) == model.operations
 
 
 def test_hierarchical_sees_nine_by_nine_texels_of_the_nearest_level() -> None:

@@ -59,17 +59,6 @@ def test_kernel_and_pytorch_agree(name: str) -> None:
     assert_gradients_agree(model, batch)
 
 
-@pytest.mark.parametrize("name", VARIANTS)
-def test_two_stages_are_the_whole(name: str) -> None:
-    model = model_of(name)
-    model.calibrate(0.5 + torch.rand(2, 4, 5, 3))
-    batch = traced_batch(model, 200)
-    features = model.stage1(batch.u, batch.sigma, batch.omega_o)
-    staged = model.stage2(features, batch.omega_i, batch.omega_o)
-    whole = model(batch.u, batch.sigma, batch.omega_i, batch.omega_o)
-    torch.testing.assert_close(staged, whole, atol=1e-5, rtol=1e-4)
-
-
 def test_the_difference_vector_is_the_light_about_the_half_vector() -> None:
     random = np.random.default_rng(0)
     arrays = random_queries(random, 100, LATTICE)
@@ -90,19 +79,6 @@ def test_the_difference_vector_is_the_light_about_the_half_vector() -> None:
     (opposite,) = model.run(["difference"], {"omega_i": view, "omega_o": light})
     opposite = opposite * torch.tensor([-1.0, -1.0, 1.0])
     torch.testing.assert_close(opposite, difference, atol=2e-5, rtol=1e-4)
-
-
-def test_weights_survive_a_round_trip_and_others_are_refused() -> None:
-    model = model_of("default")
-    tensors = model.weights()
-    again = build_model("relief", LATTICE)
-    again.load_weights(tensors)
-    batch = traced_batch(model, 50)
-    arrays = (batch.u, batch.sigma, batch.omega_i, batch.omega_o)
-    torch.testing.assert_close(again(*arrays), model(*arrays), atol=0, rtol=0)
-    others = {name: tensor for name, tensor in tensors.items() if name != "surface.light_width"}
-    with pytest.raises(InputError, match="do not fit the model relief"):
-        build_model("relief", LATTICE).load_weights(others)
 
 
 @pytest.mark.parametrize(

@@ -330,10 +330,3 @@ def test_without_a_kernel_pytorch_is_used(value: str, monkeypatch: pytest.Monkey
     finally:
         monkeypatch.undo()
         library.reload()
-
-
-def test_a_file_that_is_no_kernel_is_refused(tmp_path: Any) -> None:
-    path = tmp_path / "_kernel.so"
-    path.write_bytes(b"no library")
-    with pytest.raises(OSError, match=r"_kernel\.so"):
-        library.open_library(path)

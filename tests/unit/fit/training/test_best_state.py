@@ -6,8 +6,7 @@ import math
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.ops import Transform
 from mbtf_fit.pytorch.operations import PYTORCH, Execution
-from mbtf_fit.training.best_state import excess_error, lower_bound, overfits
+from mbtf_fit.training.best_state import excess_error, overfits
 from mbtf_fit.training.endings import describe_kept
 from mbtf_fit.training.fit import FitResult, fit
 from mbtf_fit.training.trainer import Trainer
@@ -117,26 +116,6 @@ def test_the_choice_does_not_depend_on_the_speed_of_the_machine(
     assert fit(config(), shards, tmp_path / "m").kept_step == BEST + 1
 
 
-def test_a_fit_keeps_its_last_state_unless_another_is_better_beyond_noise(
-    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Validations of states that are equally good, of which one happens to be best."""
-
-    def predict(trainer: Trainer, queries: ShardQueries) -> NDArray[np.float32]:
-        random = np.random.default_rng(trainer.progress.step)
-        value = 0.5 * (queries.value_a + queries.value_b)
-        return (value + 0.02 * random.normal(size=value.shape)).astype(np.float32)
-
-    monkeypatch.setattr(Trainer, "predict", predict)
-    monkeypatch.setattr(loop, "is_candidate", lambda step: True)
-    found = fit(config(), shards, tmp_path / "m")
-    errors = [record["unexplained"] for record in found.history]
-    assert min(errors) < 0.98 * errors[-1]
-    assert found.kept_step is None
-    assert found.material.description["training"]["kept_step"] == STEPS
-    assert describe_kept(found.history, found.kept_step) is None
-
-
 def test_a_fit_lowers_the_bound_of_its_values_where_glints_are_false(
     shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -154,25 +133,6 @@ def test_a_fit_lowers_the_bound_of_its_values_where_glints_are_false(
     # Validations alone predict at the first bound.
     assert bounds.count(300.0) == len(found.history)
     assert float(found.material.model.number("most")) == pytest.approx(300.0 / 4**2)
-
-
-@pytest.mark.parametrize(("false", "bound"), [(0.0, 200.0), (2.0, 200.0), (40.0, 12.5)])
-def test_the_bound_stays_where_less_loses_as_much(false: float, bound: float) -> None:
-    """Highlights of 100, of twice which the first bound is, or none that data have; false glints that are
-    below all bounds, or not."""
-    most = torch.tensor(200.0)
-    arrays = random_queries(np.random.default_rng(0), 3000, Lattice(3))
-    value = np.full((3000, 3), 0.1, np.float32)
-    value[::30] = 100.0 if false == 0.0 else 0.1
-    queries = ShardQueries(*arrays.values(), value, value)
-    predicted = 1.05 * value
-    predicted[7::30] += false
-    trainer = SimpleNamespace(
-        model=SimpleNamespace(bounds={"most"}, number=lambda name: most),
-        predict=lambda queries: np.minimum(predicted, float(most)),
-    )
-    lower_bound(cast(Trainer, trainer), queries, np.minimum(predicted, float(most)))
-    assert float(most) == bound
 
 
 @pytest.mark.parametrize(("by_value", "by_x"), [(1.0, math.exp(3.0)), (-1.0, 0.0)])

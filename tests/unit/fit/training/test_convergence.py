@@ -11,7 +11,6 @@ import pytest
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.folder import DataFolder
 from mbtf_fit.config import FitConfig
-from mbtf_fit.training.endings import describe_kept
 from mbtf_fit.training.next_step import NextStep, next_step
 from mbtf_fit.training.validation import FLAT, MarginalCost, caveat, marginal_cost_of
 
@@ -99,20 +98,6 @@ def test_only_a_flat_curve_says_that_longer_training_is_useless() -> None:
         assert found.doubling is not None
         assert (found.doubling >= FLAT) == useless
         assert (next_step(found, fitted(0.2, 0.002)).kind == "none") == useless
-    # Few steps ask for more, whatever the curve shows.
-    assert next_step(cost(history(0.0, steps=146), {}), fitted(0.2, 0.002)).kind == "time"
-    # Cloth of 2.35 times as much noise as signal, 58 queries per texel, after 22 steps: 151 more left 0.34 of
-    # the error.
-    found = cost(history(0.5, steps=22), {}, noise_ratio=2.35, queries_per_texel=58.2)
-    few = next_step(found, fitted(0.6, 0.01, training=0.57))
-    assert few.reason == "22 steps are few: train 32 times as long"
-    # Overfitting after 146 steps that still learn; none of them, where noise leaves nothing.
-    assert next_step(MarginalCost(0.85, 0.5, 146), fitted(0.6, 0.01)).kind == "time"
-    assert next_step(MarginalCost(0.99, 0.5, 146), fitted(0.6, 0.01)).kind == "queries"
-    # Few steps whose error is hardly below 1, and few that gain little, measured by few bright queries.
-    assert next_step(MarginalCost(0.97, None, 200), fitted(0.82, 0.04)).kind == "time"
-    decisive = {"test": fitted(0.26, 0.05)["test"] | {"n": 8192, "ten_largest": 0.47}}
-    assert next_step(MarginalCost(0.947, None, 283), decisive).kind == "test"
     # An error as uncertain as that of a glossy metal tells neither.
     for records in (history(0.02, error=0.4), history(0.25, error=0.4)):
         assert cost(records, {}).doubling is None
@@ -131,29 +116,6 @@ def test_half_of_the_distance_to_the_training_error_is_overfitting() -> None:
     for noise, share in ((None, None), (0.0, None), (0.03, 0.12), (1.0, 0.2)):
         found = cost(history(0.5), errors(0.25, 0.15), noise_variance=noise)
         assert found.noise_share == (share if share is None else pytest.approx(share))
-
-
-@pytest.mark.parametrize(
-    ("doubling", "share", "errors", "kind"),
-    [
-        (0.9, 0.1, fitted(0.2, 0.04), "time"),
-        (0.9, 0.3, fitted(0.2, 0.04), "queries"),
-        (None, 0.3, fitted(0.2, 0.04), "queries"),
-        (None, None, fitted(0.2, 0.04), "time"),
-        (0.99, 0.05, fitted(0.2, 0.04), "none"),
-        # Neither is known of an uncertain or an undefined error.
-        (0.8, None, fitted(0.2, 0.06), "test"),
-        (0.8, None, {"test": {"n": 8, "unexplained": {"value": None, "error": None}}}, "test"),
-        (0.8, None, {"test": fitted(0.2, 0.04)["test"] | {"ten_largest": 0.69}}, "test"),
-        # Worse than the mean value: training queries that were learned, or not yet.
-        (0.8, None, fitted(1.4, 0.1), "queries"),
-        (0.8, None, fitted(1.4, 0.1, training=1.2), "time"),
-    ],
-)
-def test_the_next_step_is_what_pays_most(
-    doubling: float | None, share: float | None, errors: dict[str, Any], kind: str
-) -> None:
-    assert next_step(MarginalCost(doubling, share, 4000), errors).kind == kind
 
 
 @pytest.mark.parametrize(("density", "kind"), [(50, "queries"), (800, "time"), (None, "time")])
@@ -177,59 +139,50 @@ def test_noisy_training_queries_limit_longer_training(density: float | None, kin
     assert ("140%" in step.reason) == (kind == "queries")
 
 
+def of(doubling: float | None, share: float | None = None, steps: int = 4000, **more: Any) -> MarginalCost:
+    return MarginalCost(doubling, share, steps, **more)
+
+
+NOISY = {"noise": 1.4, "density": 50, "noise_limit": 0.5}
+UNKNOWN = {"test": {"n": 8, "unexplained": {"value": None, "error": None}}}
+
+
 @pytest.mark.parametrize(
-    ("found", "errors", "kind"),
+    ("cost", "errors", "kind"),
     [
-        # Overfitting; an earlier state; noise; errors of training queries that are much smaller, or not.
-        (MarginalCost(0.8, 0.3, 4000), fitted(0.22, 0.06, training=0.2), "queries"),
-        (MarginalCost(0.8, None, 4000, kept_step=480), fitted(0.22, 0.06, training=0.2), "queries"),
-        (MarginalCost(0.8, None, 4000, 0, None, 1.4, 50, 0.5), fitted(0.22, 0.06, training=0.2), "queries"),
-        (MarginalCost(0.8, None, 4000), fitted(0.22, 0.06, training=0.03), "queries"),
-        (MarginalCost(0.8, None, 4000), fitted(0.22, 0.06, training=0.14), "test"),
-        (MarginalCost(0.8, None, 4000), fitted(0.22, 0.12, training=0.03), "test"),
-        (
-            MarginalCost(0.8, None, 4000),
-            fitted(0.22, 0.06) | {"training": {"n": 9, "unexplained": {"value": -1.0, "error": 1.3}}},
-            "test",
-        ),
+        (of(0.9, 0.1), fitted(0.2, 0.04), "time"),
+        (of(0.9, 0.3), fitted(0.2, 0.04), "queries"),
+        (of(None, 0.3), fitted(0.2, 0.04), "queries"),
+        (of(None), fitted(0.2, 0.04), "time"),
+        (of(0.99, 0.05), fitted(0.2, 0.04), "none"),
+        # Few steps: those that still learn, also overfitting, and those to which noise leaves nothing.
+        (of(0.99, steps=90), fitted(0.2, 0.002), "time"),
+        (of(0.85, 0.5, 146), fitted(0.6, 0.01), "time"),
+        (of(0.99, 0.5, 146), fitted(0.6, 0.01), "queries"),
+        (of(0.97, steps=200), fitted(0.82, 0.04), "time"),
+        (of(0.947, steps=283), {"test": fitted(0.26, 0.05)["test"] | {"ten_largest": 0.47}}, "test"),
+        # Neither is known of an uncertain or an undefined error, unless training queries are too few.
+        (of(0.8), fitted(0.2, 0.06), "test"),
+        (of(0.8), UNKNOWN, "test"),
+        (of(0.8), {"test": fitted(0.2, 0.04)["test"] | {"ten_largest": 0.69}}, "test"),
+        (of(0.8, 0.3), fitted(0.22, 0.06, training=0.2), "queries"),
+        (of(0.8, **NOISY), fitted(0.22, 0.06, training=0.2), "queries"),
+        (of(0.8), fitted(0.22, 0.06, training=0.03), "queries"),
+        (of(0.8), fitted(0.22, 0.06, training=0.14), "test"),
+        (of(0.8), fitted(0.22, 0.12, training=0.03), "test"),
+        # Worse than the mean value: training queries that were learned, or not yet.
+        (of(0.8), fitted(1.4, 0.1), "queries"),
+        (of(0.8), fitted(1.4, 0.1, training=1.2), "time"),
+        # An earlier state was kept, whatever the curve shows, and overfitting is left or not.
+        (of(0.6, 0.4, kept_step=480, **NOISY), fitted(0.2, 0.002), "queries"),
+        (of(1.5, 0.12, kept_step=480), fitted(0.2, 0.002), "queries"),
+        (of(0.8, 0.08, kept_step=480), fitted(0.2, 0.002), "none"),
+        (of(0.8, kept_step=480), fitted(0.22, 0.06, training=0.2), "queries"),
+        (of(None, None, 90, kept_step=32), fitted(1.2, 0.1), "queries"),
     ],
 )
-def test_an_uncertain_error_asks_for_training_queries_where_they_are_too_few(
-    found: MarginalCost, errors: dict[str, Any], kind: str
-) -> None:
-    step = next_step(found, errors)
-    assert step.kind == kind
-    # One command makes both.
-    changed = step.options(FitConfig(), 1.0, {"train": "50/texel", "test": "8192"})
-    test = {"generate.queries.test": "32768"}
-    more = {"generate.queries.train": "100/texel"} if kind == "queries" else {}
-    assert changed == more | test
-
-
-def test_a_fit_that_kept_an_earlier_state_needs_more_queries() -> None:
-    """Whatever the curve shows; the limit of its noise is no bound, as the states differ."""
-    for doubling in (0.6, None, 1.5):
-        found = next_step(MarginalCost(doubling, 0.4, 4000, 0.0, 480, 1.4, 50.0, 1.0), fitted(0.2, 0.002))
-        assert found.kind == "queries"
-        assert "0.8 to 1 of this error" in found.reason
-    # Where no overfitting is left, the same error is expected of twice the queries.
-    for share, kind in ((None, "none"), (0.08, "none"), (0.12, "queries")):
-        step = next_step(MarginalCost(0.8, share, 4000, kept_step=1024), fitted(0.2, 0.002))
-        assert step.kind == kind
-        assert "after 1024 steps" in step.reason
-    # Few steps ask for more only where the last of them was the best.
-    for kept, kind in ((None, "time"), (32, "queries")):
-        assert next_step(MarginalCost(None, None, 90, kept_step=kept), fitted(1.2, 0.1)).kind == kind
-
-
-def test_an_early_best_state_suggests_a_shorter_time() -> None:
-    records = [{"step": step, "unexplained": 0.2} for step in (1024, 3500, 4000)]
-    assert str(describe_kept(records, 1024)).endswith("30% of the time suffices")
-    assert str(describe_kept(records, 3500)).endswith("kept the state after 3500 steps")
-    assert describe_kept(records, None) is None
-    # Few test queries leave errors undefined.
-    unknown = [{**record, "unexplained": None} for record in records]
-    assert "kept the state after 1024 steps" in str(describe_kept(unknown, 1024))
+def test_the_next_step_is_what_pays_most(cost: MarginalCost, errors: dict[str, Any], kind: str) -> None:
+    assert next_step(cost, errors).kind == kind
 
 
 def test_the_next_command_is_complete(tmp_path: Path) -> None:
@@ -237,36 +190,24 @@ def test_the_next_command_is_complete(tmp_path: Path) -> None:
     queries = {"train": "50/texel", "test": "8192"}
     manifest: dict[str, Any] = {"config": {"material": "wool maps", "queries": queries}, "layout": "shuffled"}
     data = Dataset(DataFolder.open(tmp_path / "shards"), manifest)
-    config = FitConfig.model_validate({"training": {"time": "30s"}})
 
-    def command(kind: Any, config: FitConfig = config, seconds: float = 30.1) -> str | None:
-        found = NextStep(kind, "").command(config, seconds, data, Path("material"))
-        return None if found is None else found.replace(f"{tmp_path}/", "")
+    def command(kind: Any, material: str = "material", seconds: float = 30.1, **training: Any) -> str:
+        config = FitConfig.model_validate({"training": {"time": "30s", **training}})
+        found = NextStep(kind, "").command(config, seconds, data, Path(material))
+        return str(found).replace(f"{tmp_path}/", "")
 
     fitted = "--config material/config.yaml"
     assert command("time") == f"mbtf-fit shards {fitted} --time 1min -o material-2"
     # The fewest steps took longer than the time.
     assert command("time", seconds=41.0) == f"mbtf-fit shards {fitted} --time 90s -o material-2"
-    steps = FitConfig.model_validate({"training": {"steps": 300}})
-    assert command("time", steps) == f"mbtf-fit shards {fitted} --steps 600 -o material-2"
+    assert command("time", steps=300) == f"mbtf-fit shards {fitted} --steps 600 -o material-2"
     made = "mbtf-gen 'wool maps' --config shards/config.yaml"
     again = f"mbtf-fit shards-2 {fitted} -o material-2"
     assert command("queries") == f"{made} --queries 100/texel -o shards-2 && {again}"
     more = "--queries 1 --test-queries 32768"
     assert command("test") == f"{made} {more} -o shards-2 && mbtf-fit evaluate material shards-2"
-    # Data of other test queries alone: the training queries are made again.
-    for kind, train, time in (("queries", "400/texel", ""), ("time", "200/texel", " --time 1min")):
-        found = NextStep(kind, "").command(config, 30.1, data, Path("material"), "200/texel")  # type: ignore[arg-type]
-        expected = f"{made} --queries {train} -o shards-2 && mbtf-fit shards-2 {fitted}{time} -o material-2"
-        assert (found or "").replace(f"{tmp_path}/", "") == expected
-    found = NextStep("test", "").command(config, 30.1, data, Path("material"), "200/texel")
-    assert (found or "").replace(f"{tmp_path}/", "") == command("test")
     # The digits of a name count nothing; a second sequel does.
     for name, following in (("b2_500", "b2_500-2"), ("m-2/", "m-3"), ("m-64", "m-64-2")):
-        found = NextStep("time", "").command(config, 30.0, data, Path(name))
-        assert found is not None
-        assert found.endswith(f" -o {following}")
-    assert command("none") is None
-    for unknown in ({"queries": queries}, {"material": "wool maps"}, None):
-        manifest["config"] = unknown
-        assert command("queries") is None
+        assert command("time", name).endswith(f" -o {following}")
+    manifest["config"] = {"material": "wool maps"}
+    assert command("none") == command("queries") == "None"

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,17 +13,13 @@ from support.fit_data import parallax, write_data
 import mbtf_fit.training.fit as fits
 import mbtf_fit.training.forecast as module
 import mbtf_fit.training.validation as validation
-from mbtf_core.app.console import run
-from mbtf_core.files import folders
-from mbtf_core.stats import Estimate, Interval, signal_variance
+from mbtf_core.stats import Estimate, signal_variance
 from mbtf_fit import fit
-from mbtf_fit.cli.app import app
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.endings import reached
-from mbtf_fit.training.error_forecast import ErrorForecast
 from mbtf_fit.training.forecast import forecast_fit
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.suitable_data import open_data
@@ -101,17 +94,6 @@ def test_the_law_of_the_pilots_predicts_the_fit(law: list[tuple[int, int]], shar
     # Below the level at which the law ends.
     below = forecast_fit(config(steps=STEPS, error=0.01), shards).error.describe()
     assert "not reachable with these queries" in below
-
-
-def test_an_error_above_all_bounds_is_reached_in_the_time() -> None:
-    """Although when it is reached is known to a factor of more than thirty only."""
-    error, time = Interval(0.019, 0.012, 0.024), Interval(20.0, 0.5, 280.0)
-    limit = Interval(0.01, 0.0, 0.02)
-    found = ErrorForecast(300.0, error, (0.05, time), limit).describe()
-    assert "error 0.05: reached within 5:00" in found
-    # Overfitting may add more.
-    above = ErrorForecast(300.0, replace(error, high=0.06), (0.05, replace(time, high=math.inf)), limit)
-    assert "reached" not in above.describe()
 
 
 def test_too_few_steps_give_no_forecast(law: list[tuple[int, int]], shards: Path) -> None:
@@ -189,23 +171,3 @@ def test_the_last_validation_is_the_error_of_the_fit(shards: Path, tmp_path: Pat
     reached = found.errors["test"]["unexplained"]["value"]
     assert found.history[-1]["unexplained"] == pytest.approx(reached, rel=1e-5)
     assert found.errors["held_out_queries"]["unexplained"]["value"] != pytest.approx(reached, rel=1e-3)
-
-
-def test_a_long_fit_states_time_and_size(
-    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def stop(*_: Any, **__: Any) -> Any:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(fits, "fit", stop)
-    monkeypatch.setattr("mbtf_core.forecast.processor_share", lambda: 0.5)
-    out = tmp_path / "material"
-    assert run(app, [str(shards), "--time", "2min", "-o", str(out)]) == 130
-    # Loading and evaluation are included, and take longer where other work leaves less.
-    assert "expected: about 2:16, " in capsys.readouterr().err
-    assert run(app, [str(shards), "--time", "20s", "-o", str(out)]) == 130
-    assert "expected" not in capsys.readouterr().err
-    monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e4))
-    assert run(app, [str(shards), "-o", str(out)]) == 3
-    assert "10 kB are free" in capsys.readouterr().err
-    assert not out.exists()

@@ -26,7 +26,6 @@ from mbtf_fit.training.fit import fit_jointly
 from mbtf_fit.training.fit_export import Member
 from mbtf_fit.training.fit_folder import read_history
 from mbtf_fit.training.trainer import Trainer
-from mbtf_fit.training.validation import history_record
 
 NAMES = ("waves", "stripes", "third")
 BATCH = {"batch": 512, "warmup": 10}
@@ -206,23 +205,6 @@ def test_a_killed_joint_fit_ends_with_the_same_bits(
     assert all(again.resumed for again in fit_two(config, data, out))
 
 
-def test_training_stops_once_all_materials_have_reached_the_error(
-    data: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The first one has after step 2, the other after step 5."""
-
-    def record(trainer: Trainer, *validation: Any) -> dict[str, Any]:
-        least = 2 if trainer.model.lattice.finest == 3 else 5
-        error = 0.1 if trainer.progress.step >= least else 0.9
-        return history_record(trainer, *validation) | {"unexplained": error, "unexplained_error": 0.01}
-
-    monkeypatch.setattr(mbtf_fit.training.fit, "history_record", record)
-    monkeypatch.setattr(mbtf_fit.training.fit, "_REPORT_SECONDS", 0.0)
-    training = {"steps": 9, "shared_decoder": True, "error": 0.5, **BATCH}
-    for found in fit_two(FitConfig.model_validate({"model": "neumip", "training": training}), data, tmp_path):
-        assert [r["step"] for r in found.history] == [1, 2, 3, 4, 5]
-
-
 def test_a_lost_material_is_fitted_again(
     data: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -258,20 +240,6 @@ def test_other_data_sets_are_another_fit(data: dict[str, Path], tmp_path: Path) 
     fit_jointly(joint_config(steps=2), *arguments, overwrite=True)
     first, second = (networks_of(tmp_path / name) for name in names)
     assert all(torch.equal(first[name], second[name]) for name in first)
-
-
-def test_divergence_names_the_material(
-    data: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    step = Trainer._step
-
-    def poisoned(self: Trainer, *arguments: Any) -> torch.Tensor:
-        loss = step(self, *arguments)
-        return loss * float("nan") if self.progress.step == 3 else loss
-
-    monkeypatch.setattr(Trainer, "_step", poisoned)
-    with pytest.raises(InputError, match=r"stripes: training diverged at step 4"):
-        fit_two(joint_config(steps=6), data, tmp_path)
 
 
 def test_other_architectures_are_refused(data: dict[str, Path], tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.images.resample import resample
 from mbtf_fit import FitConfig, Material, fit
-from mbtf_fit.native import library
 from mbtf_fit.training.fit import FitResult
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import generate
@@ -31,15 +29,6 @@ ROUGH = geometry(LATTICE, rough_heights(12, 16), roughness=0.4, metallic=0.7, se
 def shards(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data") / "shards"
     return write_data(folder, parallax, train=3000, test=500, aspect=0.75, noise=0.01, geometry=ROUGH)
-
-
-@pytest.fixture
-def no_kernel(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setenv(library.ENVIRONMENT, "off")
-    library.reload()
-    yield
-    monkeypatch.undo()
-    library.reload()
 
 
 def config(steps: int, *, memory: str = "1GB", **options: Any) -> FitConfig:
@@ -62,21 +51,6 @@ def test_hints_of_the_data_and_of_batches_give_one_fit(shards: Path, tmp_path: P
     for other in others:
         assert all(torch.equal(tensor, weights(whole)[name]) for name, tensor in weights(other).items())
         assert other.errors == whole.errors
-
-
-@pytest.mark.skipif(library.kernel() is None, reason=library.missing_reason() or "kernel")
-@pytest.mark.parametrize("model", ["relief", "neumip+"])
-def test_pytorch_fits_as_the_kernel_does(
-    model: str, shards: Path, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
-    compiled = fit(config(8, model=model), shards, tmp_path / "compiled")
-    request.getfixturevalue("no_kernel")
-    plain = fit(config(8, model=model), shards, tmp_path / "plain")
-    described = [r.material.description["training"] for r in (compiled, plain)]
-    assert [d["backend"].split()[0] for d in described] == ["kernel", "pytorch"]
-    # Not the loss: it is the mean since the last report, which a busy machine sends after fewer steps.
-    errors = [r.errors["test"]["unexplained"]["value"] for r in (compiled, plain)]
-    assert errors[1] == pytest.approx(errors[0], rel=1e-2)
 
 
 def test_a_material_keeps_its_surface(shards: Path, tmp_path: Path) -> None:

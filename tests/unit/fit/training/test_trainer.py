@@ -144,16 +144,6 @@ def test_a_time_budget_takes_its_fewest_steps() -> None:
     assert trainer(queries(), steps=None, time="1h, at least 1 steps").fraction == 0.0
 
 
-def test_a_time_budget_ends_training_and_annealing() -> None:
-    t = train_fully(trainer(queries(), steps=None, time=0.3))
-    assert t.fraction == 1.0
-    assert t.progress.seconds >= 0.3
-    pyramid, offset = t.model.textures()
-    tables = t._tables()
-    assert tables[0] is pyramid.texels
-    torch.testing.assert_close(tables[1], offset.blurred(2.0))
-
-
 def test_a_snapshot_keeps_a_state_however_often_training_goes_on() -> None:
     loop = TrainingLoop([trainer(queries())])
     loop.train(0.0)
