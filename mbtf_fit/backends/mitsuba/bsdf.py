@@ -26,6 +26,7 @@ from mbtf_fit.backends.mitsuba.evaluator import Evaluator, Values
 from mbtf_fit.backends.mitsuba.frame import Frame
 from mbtf_fit.backends.mitsuba.mixture import Mixture
 from mbtf_fit.backends.mitsuba.names import BSDF_NAME, footprints_provided, options_of
+from mbtf_fit.backends.mitsuba.partials import FootprintRequest, uv_partials
 from mbtf_fit.backends.mitsuba.shade import DirectLight
 from mbtf_fit.backends.mitsuba.shell import ShellHit, clamped
 from mbtf_fit.backends.mitsuba.stored_material import StoredMaterial, read_material
@@ -118,7 +119,7 @@ class MbtfBSDF(mi.BSDF):
         self.uv_scale = mi.Point2f(*(dr.opaque(mi.Float, number) for number in options.uv_scale))
         self.sigma_given = options.sigma is not None
         self.sigma = dr.opaque(mi.Float, options.sigma or stored.lattice.sigma_range[0])
-        self.folder = folder
+        self.folder, self.request = folder, FootprintRequest()
         super().__init__(props)
         known = mi.BSDFFlags
         self.m_flags = known.GlossyReflection | known.FrontSide | known.SpatiallyVarying | known.Anisotropic
@@ -131,8 +132,9 @@ class MbtfBSDF(mi.BSDF):
             self.m_components = [self.m_flags, through]
             self.m_flags |= through
 
-    def _warn_once(self) -> None:
-        if footprints_provided.get() or self.sigma_given or self.folder in _warned:
+    def _warn_once(self, si: SurfaceInteraction3f) -> None:
+        provided = footprints_provided.get() or hasattr(si, "footprint")
+        if provided or self.sigma_given or self.folder in _warned:
             return
         _warned.add(self.folder)
         _log.warning(
@@ -143,9 +145,8 @@ class MbtfBSDF(mi.BSDF):
 
     def footprint(self, si: SurfaceInteraction3f) -> Float:
         """σ at hits in tile widths, from the area of a pixel on the surface."""
-        area = (
-            dr.abs(si.duv_dx.x * si.duv_dy.y - si.duv_dx.y * si.duv_dy.x) * self.uv_scale.x * self.uv_scale.y
-        )
+        dx, dy = uv_partials(si)
+        area = dr.abs(dx.x * dy.y - dx.y * dy.x) * self.uv_scale.x * self.uv_scale.y
         return dr.select(area > 0, pixel_sigma(area), self.sigma)
 
     def uv(self, si: SurfaceInteraction3f) -> Point2f:
@@ -153,7 +154,7 @@ class MbtfBSDF(mi.BSDF):
         return mi.Point2f(self.uv_scale.x * si.uv.x, 1.0 - self.uv_scale.y * si.uv.y / self.lattice.aspect)
 
     def _view(self, si: SurfaceInteraction3f) -> View:
-        self._warn_once()
+        self._warn_once(si)
         frame, u = Frame.at(si, self.two_sided, self.uv_scale), self.uv(si)
         level = self.evaluator.level(self.footprint(si))
         wi = frame.to_tile(si.wi)
@@ -227,6 +228,9 @@ class MbtfBSDF(mi.BSDF):
         callback.put("sigma", self.sigma, mi.ParamFlags.NonDifferentiable)
         for name, textures in self.evaluator.textures.items():
             callback.put(name.replace(".", "_"), textures.buffer, mi.ParamFlags.Differentiable)
+        if hasattr(mi.Texture, "filtered"):
+            # Found by the scene, which then computes footprints.
+            callback.put("footprint", self.request, mi.ParamFlags.NonDifferentiable)
 
     def to_string(self) -> str:
         """Text that Mitsuba prints."""

@@ -22,7 +22,8 @@ DEEPEST = 0.5
 def with_normal_partials(si: SurfaceInteraction3f, active: Any = True) -> SurfaceInteraction3f:
     """`si` with the derivatives of the shading normal by uv; 0 for instances, whose frame is unknown."""
     si = type(si)(si)
-    active = active & si.is_valid() & (si.instance == None)  # noqa: E711
+    # Mitsuba from 3.10 on has no such field.
+    active = active & si.is_valid() & (getattr(si, "instance", None) == None)  # noqa: E711
     towards = si.to_world(si.wi)
     ray = mi.Ray3f(si.p + towards, -towards)
     pi = dr.zeros(mi.PreliminaryIntersection3f, dr.width(si.t))

@@ -3,8 +3,8 @@
 A cone has a width, the side of the square that a pixel covers across the ray, and a spread, by which the
 width grows per unit of length (Amanatides 1984; Akenine-Möller et al. 2019). The initial values are the
 sensor's ray differentials of whole pixels. At a hit its footprint is the projection of the square
-onto the surface, whose curvature is neglected. The spread of a scattered ray's cone is bounded below by the
-density of its direction.
+onto the surface, as it is from Mitsuba 3.10 on where camera rays of its own integrators hit. The curvature of
+surfaces is neglected. The spread of a scattered ray's cone is bounded below by the density of its direction.
 
 At grazing angles a pixel's footprint is an ellipse, while those of materials are round. An elongated Gaussian
 is the mean of narrow ones along its major axis, so every hit on a surface's material looks up one of them at
@@ -24,6 +24,7 @@ from mbtf_core.pictures import PIXEL_SIGMA
 from mbtf_fit.backends.mitsuba.bsdf import MbtfBSDF, check_scene
 from mbtf_fit.backends.mitsuba.curvature import with_normal_partials
 from mbtf_fit.backends.mitsuba.names import INTEGRATOR_NAME, footprints_provided, options_of
+from mbtf_fit.backends.mitsuba.partials import set_uv_partials, uv_partials
 from mbtf_fit.ops.constants import MAX_ANISOTROPY
 from mbtf_gen.engine.types import (
     DirectionSample3f,
@@ -63,7 +64,7 @@ def write_footprint(si: SurfaceInteraction3f, ray: Ray3f, width: Float) -> Surfa
         a, b = dr.dot(si.dp_du, step), dr.dot(si.dp_dv, step)
         return mi.Vector2f((g * a - f * b) * inverse, (e * b - f * a) * inverse)
 
-    si.duv_dx, si.duv_dy = partials(along), partials(beside)
+    set_uv_partials(si, partials(along), partials(beside))
     return si
 
 
@@ -79,7 +80,7 @@ def narrow_footprint(
     most : largest ratio of the radii; of more elongated footprints the minor radius is enlarged
     active : hits to change
     """
-    dx, dy = si.duv_dx, si.duv_dy
+    dx, dy = uv_partials(si)
     # Squared semi-axes of the image of the unit circle, and the direction of the major one.
     xx, xy, yy = (
         dr.square(dx.x) + dr.square(dy.x),
@@ -95,8 +96,8 @@ def narrow_footprint(
     step = PIXEL_SIGMA * dr.sqrt(dr.maximum(major - minor, 0.0)) * normal
     si, side = type(si)(si), dr.sqrt(minor)
     si.uv[active] = si.uv + step * mi.Vector2f(cos, sin)
-    si.duv_dx = dr.select(active, mi.Vector2f(side, 0.0), dx)
-    si.duv_dy = dr.select(active, mi.Vector2f(0.0, side), dy)
+    narrow = mi.Vector2f(side, 0.0), mi.Vector2f(0.0, side)
+    set_uv_partials(si, dr.select(active, narrow[0], dx), dr.select(active, narrow[1], dy))
     return si
 
 

@@ -22,6 +22,7 @@ from mbtf_core.errors import InputError, MbtfError, UsageError
 from mbtf_core.pictures import Camera
 from mbtf_fit import Material
 from mbtf_fit.backends.mitsuba import load_scene
+from mbtf_fit.backends.mitsuba.partials import set_uv_partials, uv_partials
 from mbtf_fit.material.transmittance import Transmittance
 
 LIGHT = from_angles(40.0, 20.0)
@@ -170,6 +171,47 @@ def test_other_integrators_use_the_given_footprint(tmp_path: Path, caplog: pytes
                 found = through_pixel_centers(scene, CAMERA, unmodified).reshape(-1, 3)
         assert deviation(found, wanted) < 4e-3
         assert len([r for r in caplog.records if "mbtf_path" in r.message]) == (0 if given else 1)
+
+
+@pytest.mark.parametrize("scale", [None, 0.25])
+def test_footprints_of_mitsuba_are_used(
+    scale: float | None, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Those of whole pixels, here of a surface that is seen at 60°, and given for one of 16 samples."""
+
+    class Hit(mi.SurfaceInteraction3f):  # type: ignore[misc]
+        """One of Mitsuba 3.10."""
+
+    fitted, tilted = write_material(tmp_path, finest=4, contrast=0.2, brightness=0.5), 30.0
+    width, turn = 0.05, np.radians(tilted)
+    sides = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) * [2 * width, width]
+    hits = interaction(1, (0.3, 0.2, 0.9), dp_du=mi.Vector3f(1, 0, 0), dp_dv=mi.Vector3f(0, -1, 0))
+    hit, light = Hit(hits), from_angles(50.0, 30.0)
+    hit.footprint = mi.Matrix2f(sides * (scale or 1.0))
+    if scale is not None:
+        hit.footprint_scale = mi.Float(scale)
+    with caplog.at_level(logging.WARNING, logger="mbtf_fit"):
+        found = np.array(
+            mi.load_dict(bsdf(tmp_path)).eval(mi.BSDFContext(), hit, mi.Vector3f(*light.tolist()))
+        ).T
+    # The Gaussian of a pixel has half its width.
+    viewer, sigma = np.array(hits.wi).T, [0.5 * width * np.sqrt(2.0)]
+    wanted = fitted.evaluate(np.array([[0.0, 1.0]]), np.array(sigma), light[None], viewer)
+    assert deviation(found / light[2], wanted) < 1e-4
+    assert not caplog.records
+    set_uv_partials(hit, *uv_partials(hit))
+    np.testing.assert_allclose(np.array(hit.footprint)[..., 0], sides, rtol=1e-5)
+
+
+def test_scenes_are_asked_for_footprints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a texture among the objects that a scene finds, where textures may be filtered."""
+    write_material(tmp_path, finest=2)
+    scene = lit(plane(bsdf(tmp_path)), sensor_of(CAMERA))
+    names = mi.traverse(scene).keys()
+    monkeypatch.setattr(mi.Texture, "filtered", lambda texture: False, raising=False)
+    asked = mi.traverse(scene)
+    assert any(node.filtered() for node in asked.hierarchy if isinstance(node, mi.Texture))
+    assert asked.keys() == names
 
 
 @BOTH_MODELS
