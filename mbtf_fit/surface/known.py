@@ -24,6 +24,7 @@ from mbtf_fit.ops.constants import (
     AZIMUTHS,
     COATED_CHANNELS,
     DIELECTRIC,
+    DIFFUSE_CHANNELS,
     FIBER_CHANNELS,
     FIBERS,
     GLOSSY_CHANNELS,
@@ -318,7 +319,8 @@ def _azimuth(omega: Tensor) -> Tensor:
 def surface_bytes(lattice: Lattice) -> int:
     """Bytes of the surface in a material, besides its heights."""
     finer = Lattice(lattice.finest + 1, lattice.aspect)
-    maps = COATED_CHANNELS * sum(finer.texels(s) for s in range(finer.finest + 1))
+    channels = max(COATED_CHANNELS, DIFFUSE_CHANNELS + FIBER_CHANNELS)
+    maps = channels * sum(finer.texels(s) for s in range(finer.finest + 1))
     return 4 * (maps + 2 * AZIMUTHS * sum(lattice.texels(s) for s in range(lattice.finest + 1)))
 
 
