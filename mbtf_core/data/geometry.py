@@ -217,6 +217,9 @@ def _check(geometry: Geometry, path: Path) -> None:
             raise InputError(f"'{name}' has another size than 'slope'", where=path)
         if not np.isfinite(array).all():
             raise InputError(f"'{name}' holds NaN or infinite numbers", where=path)
+        squares = array[..., (0, 3, 5)] if name == "tangent_moment" else array
+        if name in ("tangent_moment", "longitudinal_variance") and squares.min() < 0:
+            raise InputError(f"'{name}' holds negative means of squares", where=path)
         if spec.unit == "1" and not (array.min() >= 0 and array.max() <= 1):
             raise InputError(f"'{name}' holds numbers outside [0, 1]", where=path)
     if geometry.heights.max() != 0:

@@ -13,8 +13,8 @@ from torch import Tensor
 
 # Arrays of a shard that the fitter reads.
 NEEDED = ("u", "sigma", "omega_i", "omega_o", "value_a", "value_b")
-# Bytes of a training query in memory, and of its hints.
-QUERY_BYTES, HINT_BYTES = 48, 28
+# Bytes of a training query in memory.
+QUERY_BYTES = 48
 
 
 def needed(estimates: int, weighted: bool = False) -> tuple[str, ...]:
@@ -103,7 +103,7 @@ def mean_value(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.flo
 @dataclass(frozen=True)
 class TrainingQueries:
     """Queries for training: contiguous tensors on the device; the value is the mean of both halves. Models of
-    a known surface have :mod:`hints <mbtf_fit.surface.known>` (n, 7)."""
+    a known surface have :mod:`hints <mbtf_fit.surface.known>`."""
 
     u: Tensor
     sigma: Tensor

@@ -24,9 +24,9 @@ from mbtf_fit.export.checks import check_stored
 from mbtf_fit.export.json import LAYERS_NAME
 from mbtf_fit.export.json import write as write_layers
 from mbtf_fit.material.texture_formats import BLOCK, QUANTIZED, TextureFormat, decode, encode, grouped
-from mbtf_fit.ops.constants import HEIGHTS, HORIZONS, MAPS
+from mbtf_fit.ops.constants import FIBERS, HEIGHTS, HORIZONS, MAPS
 
-_TEXTURES = ("pyramid", "offset_texture", "features", MAPS, HORIZONS, HEIGHTS)
+_TEXTURES = ("pyramid", "offset_texture", "features", MAPS, FIBERS, HORIZONS, HEIGHTS)
 _NAMES = [f"{name}.dds" for name in _TEXTURES]
 # DXGI_FORMAT by bytes of a channel's texel or block, and channels of a slice.
 _FORMATS = {(1, 1): 61, (1, 2): 49, (2, 1): 56, (8, 1): 80, (8, 2): 83}

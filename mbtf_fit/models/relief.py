@@ -18,6 +18,7 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 from mbtf_core.data.lattice import Lattice
+from mbtf_fit.data.queries import QUERY_BYTES
 from mbtf_fit.models.model import PYRAMID, SHARED, Model, Preparation
 from mbtf_fit.models.neumip import color, encode_directions, encode_position, hidden_layers, pyramid
 from mbtf_fit.ops import Displace, Gate, Network, Operation, Rotate, Shade, Trace, Transform
@@ -34,8 +35,8 @@ from mbtf_fit.ops.constants import (
 )
 from mbtf_fit.sections import NetworkSection
 
-# Bytes of a training query in memory, and of each of its hints.
-QUERY_BYTES, HINT_BYTES = 48, 4
+# Bytes of a hint in memory.
+HINT_BYTES = 4
 
 
 class Relief(Model):

@@ -20,7 +20,7 @@ HINTS = 7
 # Of the model `cloth`: columns about the fibers behind the hints, channels of their maps; bounds from below
 # of the coverage, of cosines about the axis, of the variance of the lobe in rad².
 FIBER_HINTS, FIBER_CHANNELS = 6, 7
-LEAST_TANGENTS, LEAST_FIBER_COSINE, LEAST_FIBER_VARIANCE = 1e-3, 0.02, 0.005
+LEAST_TANGENTS, LEAST_FIBER_COSINE, LEAST_FIBER_VARIANCE = 0.05, 0.02, 0.005
 # Factor of the irradiance under the logarithm.
 IRRADIANCE_SCALE = 4.0
 # Channels of the maps: center of the slopes (x, y), moments about 0 (xx, xy, yy), base color (RGB); of glossy

@@ -372,6 +372,8 @@ class NeuralMaterial(nn.Module):
                 self.surface = KnownSurface.from_tensors(known, self.lattice)
             except (KeyError, ValueError) as error:
                 raise self._unfit(str(error)) from None
+            if self.fiber_frame is not None and not self.surface.fibers:
+                raise self._unfit(f"'{FIBERS}.0'")
         calibration = tensors.get(CALIBRATION)
         if calibration is not None:
             # Of any number of knots.

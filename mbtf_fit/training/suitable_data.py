@@ -27,11 +27,11 @@ def open_data(folder: str | Path | DataFolder, model: str, cache: float | None =
             else "measured data have no other layout; choose another model: --model neumip+",
         )
     record = data.manifest["geometry"]
-    if missing := [name for name in needs.reads_geometry if name not in (record or {}).get("channels", {})]:
-        lacks = "no geometry" if record is None else f"no '{missing[0]}' in its geometry"
+    if not set(needs.reads_geometry) <= {*(record or {}).get("channels", ())}:
+        lacks, other = ("geometry", "neumip+") if record is None else ("fibers in its geometry", "relief")
         raise InputError(
-            f"the data set has {lacks}, which {model} reads",
+            f"the data set has no {lacks}, which {model} reads",
             where=data.folder,
-            hint=f"fit another model: --model {'neumip+' if record is None else 'relief'}",
+            hint=f"fit another model: --model {other}",
         )
     return data

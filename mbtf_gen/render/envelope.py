@@ -22,8 +22,9 @@ from mbtf_gen.render.scene import TileScene, build_scene
 from mbtf_gen.tile.fiber_tile import FiberTile
 from mbtf_gen.tile.protocol import Tile
 
-# Level of the grid of heights: so many above the finest of the data, up to a level, at least that of maps.
-_FINER, _USUAL = 3, 10
+# Level of the grid of heights: so many above the finest of the data, up to a level and as many rays as fit
+# into memory, at least that of maps.
+_FINER, _USUAL, _RAYS = 3, 10, 1 << 22
 # Largest slope that counts: those of a tube's sides grow without bound.
 _STEEPEST = 3.0
 
@@ -40,12 +41,14 @@ def seen_from_above(tile: Tile, finest: int, on: Collection[str]) -> Geometry:
     on : names of the effects that are simulated
     """
     level = min(finest + 1, FINEST_LEVEL)
-    grid = Lattice(max(level, min(finest + _FINER, _USUAL)), tile.aspect).shape()
+    fine = max(level, min(finest + _FINER, _USUAL))
+    while fine > level and Lattice(fine, tile.aspect).texels() > _RAYS:
+        fine -= 1
+    grid = Lattice(fine, tile.aspect).shape()
     scene = build_scene(tile, tile.surface(on))
     si = _vertical_hits(scene, grid)
     covered = _image(si.is_valid(), grid)
     heights = np.where(covered > 0.0, _image(si.p.z, grid) / scene.unit, -tile.thickness)
-    values = _fibers(tile, si, grid) if isinstance(tile, FiberTile) else _reflectance(scene, si, grid)
     nx, ny, nz = (_image(n, grid) for n in si.n)
     # Normals of tubes point down by rounding.
     steep = np.maximum(np.maximum(nz, np.hypot(nx, ny) / _STEEPEST), 1e-3)
@@ -54,16 +57,36 @@ def seen_from_above(tile: Tile, finest: int, on: Collection[str]) -> Geometry:
     def means(*channels: F64) -> NDArray[np.float32]:
         """Means over texels of some channels (H, W), which are 0 in gaps."""
         seen = np.stack([np.where(covered > 0.0, channel, 0.0) for channel in channels], -1)
-        out = resample(seen, *Lattice(level, tile.aspect).shape())
-        return np.asarray(out if len(channels) > 1 else out[..., 0], np.float32)
+        return np.asarray(resample(seen, *Lattice(level, tile.aspect).shape()), np.float32)
 
+    coverage = means(covered)
+
+    def of_matter(*channels: F64) -> NDArray[np.float32]:
+        """Means over what is there; gaps have the mean of the tile."""
+        seen = means(*channels)
+        out = np.where(coverage > 0.0, seen / np.maximum(coverage, 1e-6), seen.mean((0, 1)) / coverage.mean())
+        return (out if len(channels) > 1 else out[..., 0]).clip(0.0, 1.0)
+
+    fibers = {}
+    if isinstance(tile, FiberTile):
+        yarn = np.clip((_image(si.uv.x, grid) * len(tile.colors)).astype(int), 0, len(tile.colors) - 1)
+        tx, ty, tz = (_image(t, grid) for t in si.sh_frame.t)
+        # One scattering may be that of all yarns.
+        variances = np.array([s.longitudinal_variance for s in tile.scattering])
+        variance = variances[np.minimum(yarn, len(variances) - 1)]
+        products = (tx * tx, tx * ty, tx * tz, ty * ty, ty * tz, tz * tz)
+        fibers = {"tangent_moments": means(*products), "longitudinal_variance": means(variance)[..., 0]}
+        reflectance = {"base_color": list(np.moveaxis(tile.colors[yarn], -1, 0))}
+    else:
+        reflectance = _reflectance(scene, si, grid)
     return Geometry(
         np.minimum(heights - heights.max(), 0.0).astype(np.float32),
         tile.aspect,
         means(x, y),
         means(x * x, x * y, y * y),
-        opacity=None if covered.all() else means(covered).clip(0.0, 1.0),
-        **{name: means(*channels) for name, channels in values.items()},
+        opacity=None if covered.all() else coverage[..., 0].clip(0.0, 1.0),
+        **{name: of_matter(*channels) for name, channels in reflectance.items()},
+        **fibers,
     )
 
 
@@ -90,18 +113,6 @@ def _vertical_hits(scene: TileScene, shape: tuple[int, int]) -> SurfaceInteracti
 def _image(values: Float, shape: tuple[int, int]) -> F64:
     """One number per ray as an image."""
     return np.broadcast_to(np.array(values, np.float64), shape[0] * shape[1]).reshape(shape)
-
-
-def _fibers(tile: FiberTile, si: SurfaceInteraction3f, shape: tuple[int, int]) -> dict[str, list[F64]]:
-    """Channels of what is known of fibers at hits."""
-    yarn = np.clip((_image(si.uv.x, shape) * len(tile.colors)).astype(int), 0, len(tile.colors) - 1)
-    x, y, z = (_image(t, shape) for t in si.sh_frame.t)
-    variance = np.array([s.longitudinal_variance for s in tile.scattering])
-    return {
-        "base_color": list(np.moveaxis(tile.colors[yarn], -1, 0)),
-        "tangent_moments": [x * x, x * y, x * z, y * y, y * z, z * z],
-        "longitudinal_variance": [variance[yarn]],
-    }
 
 
 def _reflectance(scene: TileScene, si: SurfaceInteraction3f, shape: tuple[int, int]) -> dict[str, list[F64]]:

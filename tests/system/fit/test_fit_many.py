@@ -108,6 +108,6 @@ def test_a_model_that_traces_heights_is_refused_before_its_time_is_announced(tmp
     edit(folder / "manifest.json", lambda manifest: manifest.update(geometry=None))
     done = call(["mbtf-fit", str(folder), "--model", "relief", "-o", str(tmp_path / "m"), *QUICK])
     assert done.code == 3
-    assert "has no geometry, which relief traces" in done.err
+    assert "has no geometry, which relief reads" in done.err
     assert "training for" not in done.err
     assert not (tmp_path / "m").exists()

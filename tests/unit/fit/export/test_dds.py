@@ -22,10 +22,11 @@ from mbtf_fit.export.dds import HEADER_BYTES
 from mbtf_fit.material.texture_formats import TextureFormat
 
 
-def test_hardware_textures_are_those_of_the_material(tmp_path: Path) -> None:
+@pytest.mark.parametrize("model", ["relief", "cloth"])
+def test_hardware_textures_are_those_of_the_material(model: str, tmp_path: Path) -> None:
     """Numbers of Pillow's and imagecodecs' decoders, with the ranges of layers.json, are the material's, but
     for their rounding to 8 bits; a material that is exported in the same format has the same textures."""
-    write_material(tmp_path / "m", model="relief")
+    write_material(tmp_path / "m", model=model)
     line = ["export", str(tmp_path / "m"), "--texture-format", "bc4", "-q"]
     assert run(app, [*line, "--to", "dds", "--to", "material", "-o", str(tmp_path / "out")]) == 0
     again = ["export", str(tmp_path / "out"), "--to", "dds", "-o", str(tmp_path / "again"), "-q"]
@@ -34,8 +35,9 @@ def test_hardware_textures_are_those_of_the_material(tmp_path: Path) -> None:
     assert material.texture_format == "bc4"
     weights = material.model.weights()
     ranges = json.loads((tmp_path / "out" / "layers.json").read_text())["ranges"]
-    assert {"pyramid", "surface.maps", "surface.horizons", "surface.heights"} == ranges.keys()
-    for name in ("pyramid", "surface.horizons"):
+    fibers = {"surface.fibers"} if model == "cloth" else set()
+    assert {"pyramid", "surface.maps", "surface.horizons", "surface.heights"} | fibers == ranges.keys()
+    for name in ("pyramid", "surface.horizons", *fibers):
         data = (tmp_path / "out" / f"{name}.dds").read_bytes()
         assert (tmp_path / "again" / f"{name}.dds").read_bytes() == data
         levels = sorted(n for n in weights if n.startswith(f"{name}."))

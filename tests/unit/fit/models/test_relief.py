@@ -33,12 +33,14 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no gate": {"relief": {"gate": False}},
     "no hints": {"relief": {"hints": False}},
     "wide": {"width": 31, "channels": 11, "layers": 3, "encoding": {"direction_xyz": False}},
+    "cloth": {"relief": {"places": 2}},
+    "cloth without frame": {"relief": {"frame": False, "gate": False}},
 }
 
 
 def model_of(name: str) -> NeuralMaterial:
     """A model with random parameters on a rough surface."""
-    model = build_model("relief", LATTICE, **VARIANTS[name])
+    model = build_model("cloth" if "cloth" in name else "relief", LATTICE, **VARIANTS[name])
     model.know(rough_surface(LATTICE))
     generator = torch.Generator().manual_seed(0)
     model.initialize(generator, 0.1)
@@ -99,3 +101,9 @@ def test_tensors_of_other_shapes_are_refused(name: str, change: Callable[[Tensor
     with pytest.raises(InputError, match=f"do not fit the model relief: '{name}'") as caught:
         build_model("relief", LATTICE).load_weights({**tensors, name: change(tensors[name])})
     check_message(caught.value)
+
+
+def test_cloth_without_its_fibers_is_refused() -> None:
+    tensors = {k: t for k, t in model_of("cloth").weights().items() if not k.startswith("surface.fibers")}
+    with pytest.raises(InputError, match="do not fit the model cloth: 'surface.fibers.0'"):
+        build_model("cloth", LATTICE, **VARIANTS["cloth"]).load_weights(tensors)

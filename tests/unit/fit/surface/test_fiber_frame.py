@@ -78,6 +78,16 @@ def test_the_lobe_is_the_mean_over_directions_about_an_axis() -> None:
     torch.testing.assert_close(found[:, 2:5], alone[:, 2:5], atol=0.02, rtol=0)
 
 
+def test_two_directions_share_a_lobe_by_their_moments() -> None:
+    """Of 0.9 x and 0.1 y, the axis is x, and h·y has the variance 0.1 of its square about it."""
+    tangents = torch.tensor([[1.0, 0.0, 0.0]] * 9 + [[0.0, 1.0, 0.0]], dtype=torch.float64)
+    light, view = units(N, seed=6), units(N, seed=7)
+    found = fiber_frame(FRAME, maps_of(tangents.expand(N, 10, 3), 0.3), light, view)
+    x, y = (light + view)[:, 0], (light + view)[:, 1]
+    wanted = 0.3 * gaussian(x, VARIANCE + 0.1 * y**2)
+    torch.testing.assert_close(found[:, 0], wanted, atol=1e-5, rtol=1e-4)
+
+
 def test_gaps_have_no_lobe_and_finite_angles() -> None:
     light, view = units(N, seed=1), units(N, seed=2)
     found = fiber_frame(FRAME, torch.zeros(N, 7, dtype=torch.float64), light, view)

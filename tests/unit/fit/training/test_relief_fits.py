@@ -15,9 +15,11 @@ from torch import Tensor
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
+from mbtf_core.errors import InputError
 from mbtf_core.images.resample import resample
 from mbtf_fit import FitConfig, Material, fit
 from mbtf_fit.training.fit import FitResult
+from mbtf_fit.training.suitable_data import open_data
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import generate
 
@@ -92,3 +94,8 @@ def test_heights_learn_rendered_rock_sooner_than_neumip(tmp_path: Path) -> None:
     heights = np.asarray(resample(rock.heights, *Lattice(4).shape()))
     learned = results["neumip+"].material.model.known.heights.numpy()
     assert np.corrcoef(learned.ravel(), heights.ravel())[0, 1] > 0.5
+
+
+def test_cloth_needs_the_fibers_of_its_data(shards: Path) -> None:
+    with pytest.raises(InputError, match="has no fibers in its geometry, which cloth reads"):
+        open_data(shards, "cloth")

@@ -78,13 +78,14 @@ def test_diagonal_and_rising_fibers_keep_their_signs() -> None:
 
 
 def plates(opacity: float = 1.0) -> MeshTile:
-    """A roof over the middle half of the tile, which rises by 0.1, over a floor."""
+    """A roof over the middle half of the tile, which rises by 0.1 along x and 0.05 along y, over a floor."""
     x = np.array([0.0, 1.0, 1.0, 0.0, 0.25, 0.75, 0.75, 0.25])
     y = np.array([0.0, 0.0, 1.0, 1.0] * 2)
-    z = np.array([-0.2] * 4 + [-0.1, 0.0, 0.0, -0.1])
+    z = np.array([-0.2] * 4 + [-0.15, -0.05, 0.0, -0.1])
     quad = np.array([[0, 1, 2], [0, 2, 3]])
     floor = MeshPart("floor", {"base_color": np.array([0.1, 0.2, 0.3]), "roughness": 0.8, "specular": 0.5})
     roof = {"base_color": np.array([0.9, 0.6, 0.3]), "roughness": 0.3, "metallic": 1.0, "opacity": opacity}
+    roof |= {"clearcoat": 0.7, "clearcoat_roughness": 0.2}
     return MeshTile(
         1.0,
         np.column_stack([x, y, z]),
@@ -99,9 +100,9 @@ def test_a_mesh_has_the_heights_slopes_and_layers_of_its_highest_part() -> None:
     found = seen_from_above(plates(), FINEST, REFLECTION)
     columns = found.heights.shape[1]
     x = (np.arange(columns) + 0.5) / columns
-    over = (x > 0.25) & (x < 0.75)
-    wanted = np.where(over, 0.2 * (x - 0.25) - 0.1, -0.2)
-    wanted = np.broadcast_to(wanted - wanted.max(), found.heights.shape)
+    over, y = (x > 0.25) & (x < 0.75), 1.0 - x[:, None]
+    wanted = np.where(over, 0.2 * (x - 0.25) - 0.15 + 0.05 * y, -0.2)
+    wanted = wanted - wanted.max()
     np.testing.assert_allclose(found.heights, wanted, atol=1e-5)
     assert found.opacity is None
     for name, below, above in (
@@ -109,7 +110,9 @@ def test_a_mesh_has_the_heights_slopes_and_layers_of_its_highest_part() -> None:
         ("metallic", 0.0, 1.0),
         ("specular", 0.5, 0.0),
         ("base_color", [0.1, 0.2, 0.3], [0.9, 0.6, 0.3]),
-        ("slopes", [0.0, 0.0], [0.2, 0.0]),
+        ("clearcoat", 0.0, 0.7),
+        ("slopes", [0.0, 0.0], [0.2, 0.05]),
+        ("slope_moments", [0.0, 0.0, 0.0], [0.04, 0.01, 0.0025]),
     ):
         image = getattr(found, name)
         np.testing.assert_allclose(image[:, [2, 16]], [[below, above]] * len(image), atol=1e-5, err_msg=name)
@@ -122,14 +125,26 @@ def test_rays_pass_holes_of_a_mesh() -> None:
     assert not found.metallic.any()
 
 
-def test_gaps_of_a_mesh_are_deep_flat_and_black() -> None:
+def test_gaps_of_a_mesh_are_deep_and_flat_and_leave_its_layers() -> None:
     whole = plates()
     roof = replace(whole, faces=whole.faces[2:], part=whole.part[2:])
     found = seen_from_above(roof, FINEST, REFLECTION)
     assert found.opacity is not None
     np.testing.assert_allclose(found.opacity.mean(), 0.5, atol=1e-6)
     gap = found.opacity == 0.0
-    for image in (found.slopes, found.slope_moments, found.base_color, found.roughness):
-        assert image is not None
+    for image in (found.slopes, found.slope_moments):
         assert not image[gap].any()
-    assert found.heights.min() == pytest.approx(-0.1, abs=2e-3)
+    # Nothing is darker, glossier or smoother because it has gaps.
+    np.testing.assert_allclose(found.roughness, 0.3, atol=1e-5)
+    np.testing.assert_allclose(found.base_color[..., 1], 0.6, atol=1e-5)
+    assert found.heights.min() == pytest.approx(-0.15, abs=3e-3)
+
+
+def test_slopes_of_a_tube_are_bounded_and_lean_to_both_sides() -> None:
+    found = seen(wire((1.0, 0.0, 0.0), 0.25, 0.0))
+    along = found.slopes[:, 0, 1]
+    assert 0.5 < along.max() <= 3.0
+    np.testing.assert_allclose(along, -along[::-1], atol=0.05)
+    # Row 0 is the side of large y, where the tube falls.
+    assert along[:8].min() < -0.5
+    assert found.slope_moments[..., 2].max() <= 9.0
