@@ -105,5 +105,5 @@ def test_tensors_of_other_shapes_are_refused(name: str, change: Callable[[Tensor
 
 def test_cloth_without_its_fibers_is_refused() -> None:
     tensors = {k: t for k, t in model_of("cloth").weights().items() if not k.startswith("surface.fibers")}
-    with pytest.raises(InputError, match="do not fit the model cloth: 'surface.fibers.0'"):
+    with pytest.raises(InputError, match=r"do not fit the model cloth: 'surface\.fibers\.0'"):
         build_model("cloth", LATTICE, **VARIANTS["cloth"]).load_weights(tensors)
