@@ -20,7 +20,6 @@ EXTRAS = {
     "pxr": ("maps", "usd-core"),
     "pyarrow": ("publish", "pyarrow"),
     "pygltflib": ("maps", "pygltflib"),
-    "pyvista": ("drawing", "pyvista"),
     "s3fs": ("stores", "s3fs"),
     "slangpy": ("shaders", "slangpy"),
     "stlpips_pytorch": ("perceptual", "stlpips-pytorch"),

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.errors import EngineError
-from mbtf_core.extras import extra_error, has_extra, import_extra
 from mbtf_core.run.processes import run_child
 from mbtf_gen.checks import Absent, Check
 from mbtf_gen.engine.runtime import (
@@ -35,10 +34,6 @@ from mbtf_gen.engine.runtime import (
 # Seconds; first starts from a slow network disk take tens of them.
 _TIMEOUT = 180.0
 _REINSTALL = "install again: pip install --force-reinstall"
-_OPENGL = (
-    "only 3D pictures need it; install OpenGL (software rendering is enough), on Debian: "
-    "apt install libgl1 libegl1 libosmesa6"
-)
 _CACHE = f"without it every run compiles its kernels again; make its folder writable or set {CACHE_VARIABLE}"
 
 
@@ -49,7 +44,6 @@ def all_checks() -> list[Check]:
         Check("Mitsuba", _mitsuba, hint=f"{_REINSTALL} mitsuba==3.9.1 karellen-llvm-core"),
         Check("CUDA", _cuda, required=False),
         Check("PyTorch", partial(_in_child, use_torch), hint=f"{_REINSTALL} 'torch>=2.13,<2.15'"),
-        Check("Drawing", _drawing, required=False, hint=_OPENGL),
         Check("Kernel cache", partial(_in_child, use_kernel_cache), required=False, hint=_CACHE),
     ]
 
@@ -90,13 +84,6 @@ def _cuda() -> str:
     return "ran test kernels"
 
 
-def _drawing() -> str:
-    if not has_extra("pyvista"):
-        missing = extra_error("pyvista", "3D pictures")
-        raise Absent(f"{missing.what}; for 3D pictures: {missing.hint}")
-    return _in_child(use_drawing)
-
-
 # The functions below run in child processes.
 
 
@@ -110,19 +97,6 @@ def use_torch() -> Iterator[dict[str, str]]:
     if weight.grad.item() != -2.0:
         raise EngineError(f"a derivative is {weight.grad.item()} instead of -2")
     yield {"found": f"{torch.__version__} on {device}, took a derivative"}
-
-
-def use_drawing() -> Iterator[dict[str, str]]:
-    """PyVista draws a sphere off screen."""
-    pyvista = import_extra("pyvista", "3D pictures")
-    plotter = pyvista.Plotter(off_screen=True, window_size=[64, 64])
-    plotter.set_background("black")
-    plotter.add_mesh(pyvista.Sphere(), color="white")
-    picture = plotter.screenshot(return_img=True)
-    plotter.close()
-    if picture is None or not picture.max() > picture.min() + 100:
-        raise EngineError("the picture is empty")
-    yield {"found": f"pyvista {pyvista.__version__} drew a sphere off screen"}
 
 
 def use_kernel_cache() -> Iterator[dict[str, str]]:

@@ -1,4 +1,4 @@
-"""The pictures of ``mbtf-gen preview``: displaced mesh, path-traced picture, and query distribution."""
+"""The pictures of ``mbtf-gen preview``: path-traced picture, and query distribution."""
 
 from __future__ import annotations
 
@@ -13,15 +13,12 @@ from numpy.typing import NDArray
 from mbtf_core.app.console import Console
 from mbtf_core.color import brightness, chosen_exposure, describe_exposure
 from mbtf_core.directions import from_angles
-from mbtf_core.errors import PartialError
-from mbtf_core.extras import extra_error, has_extra
 from mbtf_core.files.folders import check_space, owned
 from mbtf_core.pictures import PNG_BYTES, Camera, claim_pictures, tiles_camera, write_display
 from mbtf_core.stats import pooled_relative_error
 from mbtf_core.units import rate_text
 from mbtf_gen.config.pictures import PreviewConfig
 from mbtf_gen.job import Job
-from mbtf_gen.pictures import mesh
 from mbtf_gen.pictures.query_plots import write_plots
 from mbtf_gen.pictures.reference import (
     note_fine_pixels,
@@ -35,7 +32,7 @@ _NOISY = 0.2
 
 @dataclass(frozen=True)
 class _Scene:
-    """A material as both 3D pictures show it."""
+    """A material as its picture shows it."""
 
     config: PreviewConfig
     job: Job
@@ -71,18 +68,6 @@ class _Scene:
         )
         return shows, exposure
 
-    def mesh(self, file: Path, exposure: float) -> tuple[str, str]:
-        """Write the picture of the mesh; returns what it shows, and why it could not be drawn, or ""."""
-        options = self.config.preview
-        drawn = mesh.tiled_mesh(self.job.material, options.tiles, exposure)
-        view, light, (rows, columns) = options.view, options.light, drawn.cells
-        shows = (
-            f"the displaced mesh ({columns} x {rows} cells per tile) of {options.tiles} x {options.tiles} "
-            f"tiles with its base color, from elevation {view.elevation:g}, azimuth {view.azimuth:g}, light "
-            f"from {light.elevation:g}, {light.azimuth:g} degrees"
-        )
-        return shows, mesh.draw(drawn, self.camera, self.omega_i, file)
-
 
 def draw_preview(config: PreviewConfig, path: Path, console: Console, *, overwrite: bool = False) -> None:
     """Draw the pictures of a material in a folder, and report them.
@@ -91,11 +76,9 @@ def draw_preview(config: PreviewConfig, path: Path, console: Console, *, overwri
     ------
     InputError : the material cannot be read, or the folder holds something else
     UsageError : the view shows the horizon
-    PartialError : the mesh could not be drawn; everything else was
     """
     scene = _scene(config)
-    material, exposure, fault = scene.job.material, 0.0, ""
-    names = ["beauty", "queries"] if material.grid is None else ["mesh", "beauty", "queries"]
+    names = ["beauty", "queries"]
     files, shown = {name: path / f"{name}.png" for name in names}, dict[str, str]()
     note_fine_pixels([scene.camera], scene.job.lattice, console)
     size = len(names) * PNG_BYTES * scene.size**2
@@ -106,30 +89,17 @@ def draw_preview(config: PreviewConfig, path: Path, console: Console, *, overwri
             "mbtf-gen preview",
             files=[file.name for file in files.values()],
             config=scene.config.model_dump(mode="json"),
-            inputs=material.digests,
+            inputs=scene.job.material.digests,
             overwrite=overwrite,
         )
         shown["beauty"], exposure = scene.beauty(
             files["beauty"], lambda share, note: bar.update(round(share, 2), note)
         )
-        if "mesh" in files:
-            # It has the exposure of the path-traced picture.
-            shown["mesh"], fault = scene.mesh(files["mesh"], exposure)
         shown["queries"] = write_plots(files["queries"], scene.job)
         bar.update(len(names), "")
-    drawn = [name for name in names if not (name == "mesh" and fault)]
-    text = "\n".join([*(f"{files[name]}: {shown[name]}" for name in drawn), describe_exposure(exposure)])
-    pictures = [{"file": files[name], "shows": shown[name]} for name in drawn]
-    console.report({"folder": path, "pictures": pictures, "exposure": exposure, "fault": fault or None}, text)
-    if fault and not has_extra("pyvista"):
-        missing = extra_error("pyvista", files["mesh"])
-        console.note(f"note: {missing.where} is not drawn: {missing.what}; {missing.hint}")
-    elif fault:
-        raise PartialError(
-            f"could not be drawn ({fault})",
-            where=files["mesh"],
-            hint="the other pictures are finished; mbtf-gen doctor names the missing package",
-        )
+    text = "\n".join([*(f"{files[name]}: {shown[name]}" for name in names), describe_exposure(exposure)])
+    pictures = [{"file": files[name], "shows": shown[name]} for name in names]
+    console.report({"folder": path, "pictures": pictures, "exposure": exposure}, text)
 
 
 def _scene(config: PreviewConfig) -> _Scene:

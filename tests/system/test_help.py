@@ -6,7 +6,7 @@ import pytest
 from conftest import RunPython
 
 PROGRAMS = {"mbtf-gen": "mbtf_gen", "mbtf-fit": "mbtf_fit", "mbtf-pipeline": "mbtf_pipeline"}
-HEAVY = {"torch", "mitsuba", "drjit", "matplotlib", "scipy", "trimesh", "pyvista", "OpenEXR", "pyarrow"}
+HEAVY = {"torch", "mitsuba", "drjit", "matplotlib", "scipy", "trimesh", "OpenEXR", "pyarrow"}
 HEAVY |= {"h5py", "dask", "distributed"}
 CODE = """
 import sys

@@ -20,7 +20,6 @@ from mbtf_core.run.cluster import open_runner
 from mbtf_fit.backends.shader.slang import SlangCompiler
 from mbtf_fit.export import gltf, materialx, usd
 from mbtf_fit.training.fit_folder import EventLog
-from mbtf_gen.doctor import use_drawing
 from mbtf_gen.measured.exported import export_neumip
 from mbtf_gen.measured.hdf5 import hdf5_file
 from mbtf_gen.publishing.croissant import croissant_text
@@ -61,7 +60,6 @@ USES: list[tuple[str, Callable[[Path], object]]] = [
     ("pxr", export(usd)),
     ("pyarrow", lambda folder: write_parquet(folder / "a.parquet", {}, {})),
     ("pygltflib", export(gltf)),
-    ("pyvista", lambda folder: next(use_drawing())),
     ("s3fs", lambda folder: open_store("s3://bucket/data")),
     ("slangpy", lambda folder: SlangCompiler()),
     ("stlpips_pytorch", lambda folder: perceptual_metrics.require()),

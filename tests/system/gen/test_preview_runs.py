@@ -1,8 +1,7 @@
-"""``mbtf-gen preview``: pictures that are there, the right way round, refused, and in agreement."""
+"""``mbtf-gen preview``: the right way round."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +9,6 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 from support.commands import Done, run_named
-
-from mbtf_core.directions import from_angles
-from mbtf_core.pictures import tiles_camera
-from mbtf_gen.pictures.mesh import draw, tiled_mesh
-from mbtf_gen.tile.loading import load_material
 
 # Quadrants of the map: top left, top right, bottom left, bottom right.
 QUADRANTS = {"red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "white": (1, 1, 1)}
@@ -43,16 +37,6 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def drawing(work: Path) -> None:
-    """Skips tests of what VTK draws where it cannot."""
-    block = tiled_mesh(load_material(work / "maps"), 1, 0.0)
-    camera = tiles_camera(40, -90, tiles=1, aspect=0.5, displacement_range=0.04, columns=64)
-    fault = draw(block, camera, from_angles(35, 150), work / "trial.png")
-    if fault:
-        pytest.skip(f"VTK cannot draw off screen here: {fault}")
-
-
-@pytest.fixture(scope="module")
 def batch(work: Path) -> dict[str, Done]:
     lines = {
         "tilted": f"preview maps -o tilted --tiles 1 {FAST} --json",
@@ -72,34 +56,10 @@ def quadrant(picture: NDArray[np.float64]) -> NDArray[np.intp]:
     return np.where(distance.min(axis=-1) < 0.6, distance.argmin(axis=-1), -1)
 
 
-@pytest.mark.usefixtures("drawing")
 def test_colors_lie_in_the_quadrants_of_the_map(batch: dict[str, Done], work: Path) -> None:
     """The camera stands towards -v: the map's first row is far, its first column left."""
-    for file in ("mesh.png", "beauty.png"):
-        picture = quadrant(pixels(work / "tilted" / file))
-        # Positions close to the picture's middle, where the tile's middle is.
-        for number, (down, right) in enumerate([(-5, -12), (-5, 12), (6, -12), (6, 12)]):
-            part = picture[36 + down - 2 : 36 + down + 3, 48 + right - 4 : 48 + right + 5]
-            assert (part == number).mean() > 0.8, (file, number)
-
-
-@pytest.mark.usefixtures("drawing")
-def test_a_preview_without_drawing_is_partial(
-    work: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from mbtf_core.app.console import run
-    from mbtf_gen.cli.app import app
-    from mbtf_gen.pictures import mesh
-
-    line = ["preview", str(work / "flat.npy"), "-o", str(work / "partial"), *FAST.split()]
-    with monkeypatch.context() as patch:
-        patch.setattr(mesh, "draw", lambda *_: "the process was ended by SIGSEGV")
-        assert run(app, line) == 4
-    assert "mesh.png: could not be drawn (the process was ended by SIGSEGV)" in capsys.readouterr().err
-    with monkeypatch.context() as patch:
-        patch.setattr(mesh, "draw", lambda *_: "pyvista is not installed")
-        patch.setitem(sys.modules, "pyvista", None)
-        assert run(app, line) == 0
-    assert "mesh.png is not drawn: pyvista is not installed" in capsys.readouterr().err
-    assert run(app, line) == 0
-    assert "mesh.png" in capsys.readouterr().out
+    picture = quadrant(pixels(work / "tilted" / "beauty.png"))
+    # Positions close to the picture's middle, where the tile's middle is.
+    for number, (down, right) in enumerate([(-5, -12), (-5, 12), (6, -12), (6, 12)]):
+        part = picture[36 + down - 2 : 36 + down + 3, 48 + right - 4 : 48 + right + 5]
+        assert (part == number).mean() > 0.8, number
