@@ -32,7 +32,15 @@ from mbtf_fit.material.reference_values import (
     texel_values,
     tile_means,
 )
-from mbtf_fit.ops.constants import COATED_CHANNELS, DIELECTRIC, GLOSSY_CHANNELS, HEIGHTS, MAPS
+from mbtf_fit.ops.constants import (
+    COATED_CHANNELS,
+    DIELECTRIC,
+    FIBERS,
+    GLOSSY_CHANNELS,
+    HEIGHTS,
+    LEAST_TANGENTS,
+    MAPS,
+)
 
 F64 = NDArray[np.float64]
 # Least roughness: smaller lobes are narrower than those that data are made with.
@@ -157,6 +165,10 @@ def surface_maps(material: Material, level: int) -> Maps:
     weights = material.model.weights()
     maps = weights[f"{MAPS}.{level}"].cpu().double().numpy()
     slopes, base = maps[..., :2], maps[..., 5:8]
+    if f"{FIBERS}.{level}" in weights:
+        # The color of the fibers: gaps, which are black, are in the opacity.
+        moments = weights[f"{FIBERS}.{level}"].cpu().double().numpy()
+        base = base / np.maximum(moments[..., [0, 3, 5]].sum(-1, keepdims=True), LEAST_TANGENTS)
     glossy = maps.shape[2] >= GLOSSY_CHANNELS
     alpha2, metallic = (
         (maps[..., 8], maps[..., 9]) if glossy else (np.ones_like(base[..., 0]), np.zeros_like(base[..., 0]))

@@ -329,6 +329,9 @@ def _map_levels(geometry: Geometry, lattice: Lattice) -> list[Tensor]:
     base = geometry.base_color
     if base is None:
         base = np.full((*geometry.slopes.shape[:2], 3), UNKNOWN_COLOR, np.float32)
+    if geometry.tangent_moments is not None and geometry.opacity is not None:
+        # Gaps between fibers are black.
+        base = base * geometry.opacity[..., None]
     rest = [base]
     coat, coat_roughness = geometry.clearcoat, geometry.clearcoat_roughness
     # α = roughness².

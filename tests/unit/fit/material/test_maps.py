@@ -43,6 +43,21 @@ def test_a_flat_lambert_tile_keeps_its_color(tmp_path: Path) -> None:
     assert maps.dielectric == 0
 
 
+def test_gaps_between_fibers_darken_hints_and_not_the_color(tmp_path: Path) -> None:
+    lattice, color, covered = Lattice(3, 1.0), (0.6, 0.3, 0.2), 0.4
+    plain = geometry(lattice, np.zeros((8, 8), np.float32), color=color)
+    shape = plain.slopes.shape[:2]
+    tangents = np.tile(np.array([covered, 0, 0, 0, 0, 0], np.float32), (*shape, 1))
+    share = np.full(shape, covered, np.float32)
+    fibers = {"tangent_moments": tangents, "longitudinal_variance": 0.1 * share, "opacity": share}
+    surface = KnownSurface.of(replace(plain, **fibers), lattice, 0.0)
+    material = write_material(tmp_path, model="cloth", glossy=False, weights=surface.tensors())
+    base = material.model.weights()["surface.maps.3"][..., 5:8].numpy()
+    np.testing.assert_allclose(base, np.broadcast_to(covered * np.array(color), base.shape), rtol=1e-4)
+    found = surface_maps(material, 3).base_color
+    np.testing.assert_allclose(found, np.broadcast_to(color, found.shape), rtol=1e-4)
+
+
 def test_normals_and_roughness_are_those_of_the_surface(tmp_path: Path) -> None:
     material = known(tmp_path, slope=(0.5, -0.25), roughness=0.3, metallic=0.8)
     maps = surface_maps(material, 2)
