@@ -6,7 +6,6 @@ import itertools
 import os
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from support.plugin_materials import write_material
 from support.published import contents
 
 from mbtf_core.files.atomic import write_chunks
-from mbtf_gen.pictures import mesh, preview
+from mbtf_gen.pictures import preview
 from mbtf_gen.publishing import publication
 
 PICTURES = "--size 8 --spp 2 --view 50,20 --light 60,80 --tiles-across 2"
@@ -45,13 +44,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def quick_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without child processes and plots, which take seconds."""
-
-    def draw(*arguments: Any) -> str:
-        write_chunks(arguments[-1], [b"a mesh"])
-        return ""
-
-    monkeypatch.setattr(mesh, "draw", draw)
+    """Without plots, which take seconds."""
     monkeypatch.setattr(preview, "write_plots", lambda file, *_: write_chunks(file, [b"plots"]))
     monkeypatch.setattr(publication, "write_picture", lambda *arguments: write_chunks(arguments[-1], [b"it"]))
 
