@@ -41,6 +41,12 @@ _ATTRIBUTES = {
 GLOSSY = ("roughness", "metallic", "specular")
 CLEARCOAT = ("clearcoat", "clearcoat_roughness")
 FIBERS = ("tangent_moments", "longitudinal_variance")
+# Components that are means of squares.
+_SQUARES: dict[str, Any] = {
+    "slope_moment": (0, 2),
+    "tangent_moment": (0, 3, 5),
+    "longitudinal_variance": None,
+}
 
 
 @dataclass(frozen=True)
@@ -133,10 +139,8 @@ def encode_geometry(geometry: Geometry) -> bytes:
     return encode_parts(parts, {_ASPECT: repr(float(geometry.aspect))})
 
 
-def geometry_record(geometry: Geometry | None) -> dict[str, Any] | None:
-    """The manifest's key ``geometry``: file, digest, channels and shapes; None without a geometry."""
-    if geometry is None:
-        return None
+def geometry_record(geometry: Geometry) -> dict[str, Any]:
+    """The manifest's key ``geometry``: file, digest, channels and shapes."""
     return {
         "file": GEOMETRY_NAME,
         "sha256": hashlib.sha256(encode_geometry(geometry)).hexdigest(),
@@ -217,15 +221,12 @@ def _check(geometry: Geometry, path: Path) -> None:
             raise InputError(f"'{name}' has another size than 'slope'", where=path)
         if not np.isfinite(array).all():
             raise InputError(f"'{name}' holds NaN or infinite numbers", where=path)
-        squares = array[..., (0, 3, 5)] if name == "tangent_moment" else array
-        if name in ("tangent_moment", "longitudinal_variance") and squares.min() < 0:
+        if name in _SQUARES and array[..., _SQUARES[name]].min() < 0:
             raise InputError(f"'{name}' holds negative means of squares", where=path)
         if spec.unit == "1" and not (array.min() >= 0 and array.max() <= 1):
             raise InputError(f"'{name}' holds numbers outside [0, 1]", where=path)
     if geometry.heights.max() != 0:
         raise InputError("the maximum of 'height' is not 0", where=path)
-    if geometry.slope_moments[..., (0, 2)].min() < 0:
-        raise InputError("'slope_moment' holds negative means of squares", where=path)
     for group in (GLOSSY, CLEARCOAT, FIBERS):
         if len({getattr(geometry, name) is None for name in group}) > 1:
             raise InputError(f"has some, but not all, of {', '.join(group)}", where=path)

@@ -107,8 +107,7 @@ def open_folder(
     stored = stored_plan(manifest, folder.at(MANIFEST_NAME))
     if manifest["geometry"] is not None and not folder.has(GEOMETRY_NAME):
         found = geometry(stored.effects)
-        record = geometry_record(found)
-        if found is None or record is None or record["sha256"] != manifest["geometry"]["sha256"]:
+        if geometry_record(found)["sha256"] != manifest["geometry"]["sha256"]:
             raise InputError(
                 "cannot be restored: this machine computes it differently",
                 where=folder.at(GEOMETRY_NAME),

@@ -118,7 +118,7 @@ def new_manifest(
     }
 
 
-def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any] | None) -> dict[str, Any]:
+def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any]) -> dict[str, Any]:
     """Manifest of a job's data set without shards; `geometry` is its key of that name."""
     tile, queries = job.material, job.query_plan
     optional = {"transmittance": plan.effects.on("opacity"), "weight": plan.highlights is not None}
@@ -138,7 +138,7 @@ def build_manifest(job: Job, plan: RunPlan, geometry: Mapping[str, Any] | None) 
         layout=queries.layout,
         patch_size=queries.patch_size,
         slice_size=None if queries.directions is None else len(queries.directions) ** 2,
-        geometry=None if geometry is None else dict(geometry),
+        geometry=dict(geometry),
         **plan.to_manifest(),
     )
     found["tile"] |= {**tile.properties(), "displacement_range": tile.thickness}
