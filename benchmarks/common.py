@@ -24,6 +24,7 @@ ASSETS = ROOT / "assets"
 # Texture sets are not part of the project; benchmarks skip those that are missing.
 TEXTURE_SETS = Path(os.environ.get("MBTF_TEXTURE_SETS", ROOT.parent / "shared" / "data" / "materials"))
 RELIEFS = ("cliff_rock", "insulation_foam", "straight_wool", "turtle_shell", "twisted_wool")
+CLOTHS = ("basket_weave", "twill_silk", "stockinette")
 # Height scale of each texture set, exaggerated where the structure is fine.
 HEIGHT_SCALES: dict[str, float] = {
     "knit_fabric": 0.05,

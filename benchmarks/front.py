@@ -8,8 +8,9 @@ For each material, all models are trained on the same data: those of the preset 
 across, of five assets and six texture sets. Test queries have 256 paths, and three quarters of them are drawn
 by the highlights: otherwise the noise of highlights hides the differences. All networks have the same width;
 ``relief`` traces one, two or four view rays per footprint, and ``neumip+`` learns heights without the
-geometry. On the materials of Kuznetsov et al. 2021, ``neumip-baseline`` is trained as well, for the ratios
-that they published. ``--ablation`` leaves out one part of a model at a time, on one material (``rock_cliff``
+geometry. On cloth, which is measured where it is named, ``cloth`` takes the place of ``relief``. On the
+materials of Kuznetsov et al. 2021, ``neumip-baseline`` is trained as well, for the ratios that they
+published. ``--ablation`` leaves out one part of a model at a time, on one material (``rock_cliff``
 by default). ``--rock-cliff`` is the benchmark ``rock_cliff-128``: models of their default sizes, a larger
 ``neumip`` and the baseline, on the data of ``pipelines/rock_cliff.yaml``, with thresholds of their
 unexplained variance.
@@ -30,7 +31,18 @@ from pathlib import Path
 from statistics import mean, median, stdev
 from typing import Any
 
-from common import HEIGHT_SCALES, RELIEFS, ROOT, finish, is_available, kept, parser_of, processor, start
+from common import (
+    CLOTHS,
+    HEIGHT_SCALES,
+    RELIEFS,
+    ROOT,
+    finish,
+    is_available,
+    kept,
+    parser_of,
+    processor,
+    start,
+)
 from quality import generator_config
 
 from mbtf_core.config.settings import deep_merge, resolve
@@ -83,6 +95,11 @@ MODELS: dict[str, dict[str, Any]] = {
     "relief": RELIEF,
     **{rays: deep_merge(RELIEF, {"network": PARTS["relief"][rays]}) for rays in ("two rays", "four rays")},
 }
+# On cloth, by the same labels.
+CLOTH_MODELS: dict[str, dict[str, Any]] = {
+    label: {**options, "model": "cloth"} if options["model"] == "relief" else options
+    for label, options in MODELS.items()
+}
 THRESHOLDS = {"displaced": 0.6, "any": 1.0}
 STANDARD_ERRORS = 2.0
 # Displacement range in tile widths from which a material counts as displaced.
@@ -100,6 +117,11 @@ BENCHMARK: dict[str, tuple[dict[str, Any], float | None]] = {
 }
 # Least error of the baseline over that of neumip.
 OVER_NEUMIP = 1.2
+
+
+def models_of(name: str) -> dict[str, dict[str, Any]]:
+    """Models that are compared on a material."""
+    return CLOTH_MODELS if name in CLOTHS else MODELS
 
 
 def shards(name: str, folder: Path) -> Path:
@@ -178,7 +200,7 @@ def compared(name: str, folder: Path, steps: dict[str, int], seeds: int) -> dict
             label: train(label, o, data, folder / name, steps[label], seeds) for label, o in models.items()
         }
 
-    fits = fits_of(MODELS)
+    fits = fits_of(models_of(name))
     ratio, error = ratio_of(fits["relief"], fits["neumip"])
     extent = Dataset.open(data).manifest["tile"]["displacement_range"]
     limit = THRESHOLDS["displaced" if extent >= DISPLACED else "any"]
@@ -240,8 +262,13 @@ def main() -> int:
     if arguments.ablation:
         return ablation(arguments.ablation, (arguments.materials or ["rock_cliff"])[0], out, time, seeds)
     names = [n for n in arguments.materials or [*RELIEFS, *HEIGHT_SCALES] if is_available(n)]
-    steps = steps_of({**MODELS, **BASELINE}, shards(names[0], out), out, time)
-    found = [compared(name, out, steps, seeds) for name in names]
+    found = []
+    for cloth in (False, True):
+        group = [name for name in names if (name in CLOTHS) == cloth]
+        if group:
+            rates = out / "cloth" if cloth else out
+            steps = steps_of({**models_of(group[0]), **BASELINE}, shards(group[0], out), rates, time)
+            found += [compared(name, out, steps, seeds) for name in group]
     return finish(found, THRESHOLDS, bool(found) and all(one["met"] for one in found))
 
 

@@ -199,6 +199,11 @@ class TrainingSection(Settings):
         le=10,
         description="weight decay (L2) of the texels per step, times the learning rate; noise adds to it",
     )
+    residual_levels: bool = Field(
+        False,
+        description="train what each level of the pyramid adds to the next coarser one (Burt and Adelson "
+        "1983), not independent levels",
+    )
     noise_regularization: float = Field(
         1.0,
         ge=0,

@@ -58,6 +58,7 @@ class LearnedRelief(Relief):
             "relief": {"gate": False},
         },
         "training": {
+            "residual_levels": True,
             "texture_weight_decay": 1.0,
             "blur": {"min_sigma": 0.8, "offset_sigma": 2.0},
             # The relative loss alone leaves the grazing highlights of fibers at half their value.

@@ -25,11 +25,13 @@ SPECIAL = (
     "network.encoding",
     *(f"network.relief.{name}" for name in ("places", "hints", "frame", "gate")),
     *("init_from", "decoder", "training.shared_decoder", "training.materials", "training.own_material"),
+    "training.residual_levels",
 )
 # Those of a network that decodes a pyramid of textures.
 PYRAMID = (
     *("network.channels", "network.width", "network.layers", "network.activation", "network.output_channels"),
     *("network.output_transform", "network.oversampling", "network.encoding", "init_from"),
+    "training.residual_levels",
 )
 SHARED = ("decoder", "training.shared_decoder")
 

@@ -52,7 +52,7 @@ class Relief(Model):
             "encoding": {"direction_xyz": True, "half_vector": True},
         },
         # Oversampled texels see a quarter of the queries each: with a decay of 1, glossy materials overfit.
-        "training": {"texture_weight_decay": 2.0, "blur": {"min_sigma": 1.6}},
+        "training": {"residual_levels": True, "texture_weight_decay": 2.0, "blur": {"min_sigma": 1.6}},
     }
     reads_geometry: ClassVar[Sequence[str]] = ("height",)
     takes = (*PYRAMID, *SHARED, *(f"network.relief.{n}" for n in ("places", "hints", "frame", "gate")))

@@ -131,6 +131,7 @@ _PROTOTYPES = {
     "mbtf_adam": "viplpppp",
     "mbtf_blur_down": "vipllplllpp",
     "mbtf_blur_across": "vipllplllppp",
+    "mbtf_resample": "viplllpplpplllpp",
     "mbtf_trace": "vplppip",
     "mbtf_horizons": "vpifllp",
     "mbtf_hints": "vppfip",

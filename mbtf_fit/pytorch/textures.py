@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from mbtf_core.data.lattice import Lattice
+from mbtf_fit.pytorch.residuals import residuals_of, summed
 from mbtf_fit.surface.lookup import Packing, lookup
 
 # A Gaussian of fewer texels gives its neighbors less than 1e-5 of its weight.
@@ -98,7 +99,8 @@ def annealed_sigma(fraction: float, start: float, end: float) -> float:
 
 
 class FeatureTextures(nn.Module):
-    """Textures of some levels of a lattice, all of them independent parameters (NeuMIP, section 4.1).
+    """Textures of some levels of a lattice, all of them independent parameters (NeuMIP, section 4.1), or what
+    each adds to the next coarser one.
 
     Parameters
     ----------
@@ -110,6 +112,7 @@ class FeatureTextures(nn.Module):
     Attributes
     ----------
     texels : (texels, channels) parameter, all levels one after the other
+    residual : whether levels are sums over the coarser ones; see :meth:`make_residual`
     """
 
     def __init__(
@@ -119,6 +122,7 @@ class FeatureTextures(nn.Module):
         self.moves_lookups = moves_lookups
         self.packing = Packing.of(lattice, levels)
         self.texels = nn.Parameter(torch.zeros(self.packing.texels, channels))
+        self.residual = False
         self._table: Tensor | None = None
 
     @property
@@ -131,22 +135,30 @@ class FeatureTextures(nn.Module):
         # The texels themselves must not become a second parameter of the module.
         self._table = None if table is self.texels else table
 
+    def make_residual(self) -> None:
+        """From now on, let the parameter hold what each level adds to the next coarser one; lookups read the
+        same (:mod:`mbtf_fit.pytorch.residuals`)."""
+        with torch.no_grad():
+            self.texels.copy_(residuals_of(self.texels, self.packing))
+        self.residual = True
+
     def blurred(self, sigma: float) -> Tensor:
-        """The texels, blurred by a Gaussian of `sigma` texels of the finest level.
+        """What lookups read: the texels, blurred by a Gaussian of `sigma` texels of the finest level.
 
         Coarser levels get the same blur in tile widths: half as many texels each (as in the published
         code).
         """
-        if sigma <= 0:
-            return self.texels
-        starts, shapes = self.packing.starts, self.packing.shapes
-        finest = shapes[-1][1]
-        parts = []
-        for s, (rows, columns) in enumerate(shapes):
-            texture = self.texels[starts[s] : starts[s + 1]]
-            blurred = blur_texture(texture.view(rows, columns, -1), sigma * columns / finest)
-            parts.append(blurred.reshape(texture.shape))
-        return torch.cat(parts)
+        table: Tensor = self.texels
+        if sigma > 0:
+            starts, shapes = self.packing.starts, self.packing.shapes
+            finest = shapes[-1][1]
+            parts = []
+            for s, (rows, columns) in enumerate(shapes):
+                texture = table[starts[s] : starts[s + 1]]
+                blurred = blur_texture(texture.view(rows, columns, -1), sigma * columns / finest)
+                parts.append(blurred.reshape(texture.shape))
+            table = torch.cat(parts)
+        return summed(table, self.packing) if self.residual else table
 
     def average_coarser(self, first: int) -> None:
         """Replace all levels coarser than `first` by averages of that level."""
@@ -154,9 +166,12 @@ class FeatureTextures(nn.Module):
         if first <= 0:
             return
         with torch.no_grad():
-            finer = self.texels[starts[first] : starts[first + 1]].t().view(1, -1, *shapes[first])
+            table = summed(self.texels, self.packing) if self.residual else self.texels
+            finer = table[starts[first] : starts[first + 1]].t().view(1, -1, *shapes[first])
             averages = (nn.functional.adaptive_avg_pool2d(finer, shape)[0] for shape in shapes[:first])
-            self.texels[: starts[first]] = torch.cat([a.flatten(1).t() for a in averages])
+            table[: starts[first]] = torch.cat([a.flatten(1).t() for a in averages])
+            if self.residual:
+                self.texels.copy_(residuals_of(table, self.packing))
 
     def export(self) -> dict[str, Tensor]:
         """Current table by level, ``0`` the coarsest: (rows, columns, channels) each."""
@@ -168,7 +183,7 @@ class FeatureTextures(nn.Module):
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
         """Load tensors of :meth:`export`, to be read without blur; other entries are ignored."""
-        self._table = None
+        self._table, self.residual = None, False
         with torch.no_grad():
             parts = [tensors[str(s)].flatten(0, 1) for s in range(len(self.packing.shapes))]
             self.texels.copy_(torch.cat(parts))

@@ -171,6 +171,8 @@ class Trainer:
         self.progress = TrainingProgress()
         self.batch = min(config.training.batch, len(queries))
         texels, weights = self.hooks.trained()
+        if config.training.residual_levels:
+            model.textures()[0].make_residual()
         self.noise = noise
         self.loss = Objective(config.training, noise)
         self.regularization = self.regularization_of(len(queries))

@@ -8,6 +8,7 @@ import ctypes
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from mbtf_fit.native.library import AdamStep, Kernel
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.parallel import Workers
 from mbtf_fit.pytorch.material import NeuralMaterial
+from mbtf_fit.pytorch.residuals import Taps, interpolation
 from mbtf_fit.pytorch.textures import NEGLIGIBLE, FeatureTextures, gaussian_taps
 
 # Parameters with fewer numbers are updated by one thread.
@@ -89,6 +91,53 @@ def _taps(sigma: float, size: int) -> NDArray[np.float32]:
     return np.ascontiguousarray(gaussian_taps(sigma, size).numpy(), np.float32)
 
 
+class Sums:
+    """Sums the levels of one packed set of textures, each of which adds to the next coarser one, as
+    :func:`mbtf_fit.pytorch.residuals.summed`."""
+
+    def __init__(self, kernel: Kernel, texture: FeatureTextures) -> None:
+        self.kernel = kernel
+        self.packing = texture.packing
+        self.channels = texture.texels.shape[1]
+        shapes = self.packing.shapes
+        self._up = [
+            tuple(interpolation(a, b) for a, b in zip(fine, coarse, strict=True))
+            for coarse, fine in pairwise(shapes)
+        ]
+        self._down = [
+            tuple(taps.transposed(size) for taps, size in zip(up, coarse, strict=True))
+            for up, coarse in zip(self._up, shapes, strict=False)
+        ]
+
+    def apply(self, table: Tensor, workers: Workers) -> None:
+        """Sum the levels of a table (texels, channels) in place."""
+        for s, taps in enumerate(self._up):
+            self._add(table, s, s + 1, taps, workers)
+
+    def apply_transposed(self, gradient: Tensor, workers: Workers) -> None:
+        """The gradient (texels, channels) by the residuals from that by the texels, in place."""
+        for s, taps in reversed(list(enumerate(self._down))):
+            self._add(gradient, s + 1, s, taps, workers)
+
+    def _add(self, table: Tensor, source: int, target: int, taps: tuple[Taps, ...], workers: Workers) -> None:
+        """Add a resampled level to another one."""
+        starts, (rows, columns) = self.packing.starts, self.packing.shapes[target]
+        width = self.packing.shapes[source][1] * self.channels
+        there, here = (table.data_ptr() + 4 * starts[s] * self.channels for s in (source, target))
+        down, across = ((t.index.ctypes.data, t.weight.ctypes.data, t.index.shape[1]) for t in taps)
+
+        def add_part(part: int) -> None:
+            first, last = share(rows, part, workers.count, whole=rows * columns < _SMALL_TEXTURE)
+            if first < last:
+                wide = np.empty(width, np.float32)
+                self.kernel.library.mbtf_resample(
+                    *(self.kernel.variant, there, width, self.channels, columns, *down, *across),
+                    *(first, last, wide.ctypes.data, here),
+                )
+
+        workers.each(add_part)
+
+
 class Adam:
     """Groups of parameters with their options, and the moments of each parameter, as ``torch.optim.Adam`` has
     them. Making that one would import PyTorch's compiler, which takes a second.
@@ -118,6 +167,9 @@ class NativeStepper:
         self._tables, self._between, self._blurred = (
             [torch.empty_like(texture.texels) for texture in self._native.textures] for _ in range(3)
         )
+        self._sums = [
+            Sums(kernel, texture) if texture.residual else None for texture in self._native.textures
+        ]
 
     def step(
         self, objective: Objective, batch: TrainingQueries, sigmas: Sequence[float], workers: Workers
@@ -125,16 +177,25 @@ class NativeStepper:
         """One step on a batch, textures blurred by `sigmas` texels of the finest level; its mean loss."""
         textures = self._native.textures
         blurs = [Blur(self.kernel, t, sigma) for t, sigma in zip(textures, sigmas, strict=True)]
-        for texture, blur, between, table in zip(textures, blurs, self._between, self._tables, strict=True):
-            if blur.idle:
-                texture.read(texture.texels)
-            else:
+        for texture, blur, sums, between, table in zip(
+            textures, blurs, self._sums, self._between, self._tables, strict=True
+        ):
+            if not blur.idle:
                 blur.apply(texture.texels.detach(), between, table, workers)
-                texture.read(table)
+            elif sums is None:
+                texture.read(texture.texels)
+                continue
+            else:
+                table.copy_(texture.texels.detach())
+            if sums is not None:
+                sums.apply(table, workers)
+            texture.read(table)
         loss = self._gradients.compute(objective, batch, workers)
         found: dict[Tensor, Tensor] = {}
-        for k, (texture, blur) in enumerate(zip(textures, blurs, strict=True)):
+        for k, (texture, blur, sums) in enumerate(zip(textures, blurs, self._sums, strict=True)):
             gradient = self._gradients.textures[k]
+            if sums is not None:
+                sums.apply_transposed(gradient, workers)
             if not blur.idle:
                 # A symmetric kernel is its own transpose.
                 blur.apply(gradient, self._between[k], self._blurred[k], workers)

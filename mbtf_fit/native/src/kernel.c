@@ -219,3 +219,11 @@ EXPORT void mbtf_blur_across(int32_t variant, const float *texture, int64_t colu
                              const float **pointers, float *wide, float *out) {
     VARIANTS[variant]->blur_across(texture, columns, channels, taps, number, from, to, pointers, wide, out);
 }
+
+EXPORT void mbtf_resample(int32_t variant, const float *texture, int64_t width, int64_t channels,
+                          int64_t columns, const int32_t *down_index, const float *down, int64_t down_taps,
+                          const int32_t *across_index, const float *across, int64_t across_taps, int64_t from,
+                          int64_t to, float *wide, float *out) {
+    VARIANTS[variant]->resample(texture, width, channels, columns, down_index, down, down_taps, across_index,
+                                across, across_taps, from, to, wide, out);
+}

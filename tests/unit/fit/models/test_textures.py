@@ -9,7 +9,8 @@ import torch
 from scipy.ndimage import gaussian_filter1d
 
 from mbtf_core.data.lattice import Lattice, texel_centers
-from mbtf_fit.pytorch.textures import annealed_sigma, blur_texture
+from mbtf_fit.pytorch.residuals import enlarged
+from mbtf_fit.pytorch.textures import FeatureTextures, annealed_sigma, blur_texture
 from mbtf_fit.surface.lookup import Packing, coarse_level, lookup
 
 F64 = torch.float64
@@ -98,3 +99,40 @@ def test_annealing_ends_with_its_fraction_of_the_budget() -> None:
     assert sigmas[3] == pytest.approx(0.25, rel=0.01)
     assert sigmas[4:] == [0.0, 0.0]
     assert annealed_sigma(0.0, 0.0, 0.25) == 0.0
+
+
+@pytest.mark.parametrize("aspect", [1.0, 0.7, 1.5])
+def test_levels_as_sums_read_the_same_and_share_what_coarse_levels_learn(aspect: float) -> None:
+    lattice = Lattice(4, aspect)
+    texture = FeatureTextures(lattice, range(5), 3)
+    torch.nn.init.normal_(texture.texels, generator=torch.Generator().manual_seed(1))
+    before = texture.blurred(0.0).detach().clone()
+    texture.make_residual()
+    torch.testing.assert_close(texture.blurred(0.0), before, atol=1e-5, rtol=0)
+    # The coarsest level is part of all others: a constant of it is added everywhere.
+    with torch.no_grad():
+        texture.texels[: texture.packing.starts[1]] += 2.0
+    for sigma in (0.0, 1.5):
+        moved = texture.blurred(sigma).detach()
+        texture.texels.data[: texture.packing.starts[1]] -= 2.0
+        torch.testing.assert_close(moved, texture.blurred(sigma).detach() + 2.0, atol=1e-5, rtol=0)
+        texture.texels.data[: texture.packing.starts[1]] += 2.0
+    # Finer levels stay where coarser ones are averaged.
+    finest = texture.blurred(0.0).detach()[texture.packing.starts[4] :]
+    texture.average_coarser(4)
+    found = texture.blurred(0.0).detach()
+    torch.testing.assert_close(found[texture.packing.starts[4] :], finest, atol=1e-5, rtol=0)
+    torch.testing.assert_close(found[: texture.packing.starts[1]].mean(0), finest.mean(0), atol=1e-4, rtol=0)
+
+
+def test_interpolation_of_levels_is_exact_for_low_frequencies_and_keeps_the_mean() -> None:
+    columns, rows = torch.arange(32), torch.arange(24)
+    x, y = (columns + 0.5) / 32, (rows + 0.5) / 24
+    coarse = torch.cos(2 * torch.pi * (x[None, :] + y[:, None]))[..., None]
+    fine = enlarged(coarse, (48, 64))
+    x, y = (torch.arange(64) + 0.5) / 64, (torch.arange(48) + 0.5) / 48
+    expected = torch.cos(2 * torch.pi * (x[None, :] + y[:, None]))[..., None]
+    # Half of the squared distance of two texels, by the second derivative; both axes.
+    bound = 0.5 * (2 * math.pi) ** 2 * 0.25 * (1 / 32**2 + 1 / 24**2)
+    assert float((fine - expected).abs().max()) < bound
+    assert float(fine.mean()) == pytest.approx(float(coarse.mean()), abs=1e-6)

@@ -16,7 +16,7 @@ from torch import Tensor
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.backends.cpu.gradients import NativeGradients, query_pointers
 from mbtf_fit.backends.cpu.model import NativeModel, supports
-from mbtf_fit.backends.cpu.stepper import Blur, adam
+from mbtf_fit.backends.cpu.stepper import Blur, Sums, adam
 from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.material.inference import evaluate_in_chunks, predict
@@ -26,6 +26,7 @@ from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.objective.parallel import Workers
 from mbtf_fit.pytorch.material import NeuralMaterial
+from mbtf_fit.pytorch.residuals import summed
 
 KERNEL = library.kernel()
 needs_kernel = pytest.mark.skipif(KERNEL is None, reason=f"compiled kernel: {library.missing_reason()}")
@@ -245,6 +246,23 @@ def test_blur_is_that_of_the_reference(variant: str, aspect: float, sigma: float
             table, found = texture.texels.detach(), torch.empty_like(texture.texels)
             Blur(kernel_of(variant), texture, sigma).apply(table, torch.empty_like(table), found, workers)
         torch.testing.assert_close(found, texture.blurred(sigma).detach(), rtol=1e-5, atol=1e-6)
+
+
+@needs_kernel
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("aspect", [1.0, 0.7, 1.5])
+def test_sums_of_levels_are_those_of_the_reference(variant: str, aspect: float) -> None:
+    (texture, *_) = random_model("relief", Lattice(6, aspect), channels=5).textures()
+    kernel, residuals = kernel_of(variant), texture.texels.detach().requires_grad_()
+    expected = summed(residuals, texture.packing)
+    gradient = torch.randn_like(expected)
+    (transposed,) = torch.autograd.grad(expected, residuals, gradient)
+    with Workers(CPU, 2, limit=2) as workers:
+        found = residuals.detach().clone()
+        Sums(kernel, texture).apply(found, workers)
+        Sums(kernel, texture).apply_transposed(gradient, workers)
+    torch.testing.assert_close(found, expected.detach(), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(gradient, transposed, rtol=1e-5, atol=1e-5)
 
 
 @needs_kernel

@@ -1,0 +1,93 @@
+"""Textures as sums over their levels: a level holds what it adds to the next coarser one (Burt and Adelson,
+"The Laplacian pyramid as a compact image code", 1983).
+
+The few texels of coarse levels then learn from the queries of all finer footprints, and a texel of a fine
+level learns from noisy queries only in what it differs from its neighborhood.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mbtf_fit.surface.lookup import Packing
+
+
+@dataclass(frozen=True)
+class Taps:
+    """Numbers along an axis as weighted sums of others.
+
+    Attributes
+    ----------
+    index : (size, taps) int32 numbers that are summed
+    weight : (size, taps) float32
+    """
+
+    index: NDArray[np.int32]
+    weight: NDArray[np.float32]
+
+    def transposed(self, size: int) -> Taps:
+        """The transposed sums, over `size` numbers."""
+        dense = np.zeros((size, len(self.index)), np.float32)
+        np.add.at(dense, (self.index, np.arange(len(self.index))[:, None]), self.weight)
+        most = int((dense != 0).sum(1).max())
+        index = np.argsort(dense == 0, axis=1, kind="stable")[:, :most]
+        weight = np.take_along_axis(dense, index, 1)
+        return Taps(np.ascontiguousarray(index, np.int32), np.ascontiguousarray(weight))
+
+
+@cache
+def interpolation(size: int, coarser: int) -> Taps:
+    """Linear interpolation of a period of `coarser` texels at the centers of `size` texels."""
+    x = (np.arange(size) + 0.5) * coarser / size - 0.5
+    left = np.floor(x)
+    right = (x - left).astype(np.float32)
+    index = np.stack([left % coarser, (left + 1) % coarser], -1)
+    return Taps(index.astype(np.int32), np.stack([1 - right, right], -1))
+
+
+def enlarged(texture: Tensor, shape: tuple[int, int]) -> Tensor:
+    """A periodic texture (rows, columns, channels) at another resolution, interpolated; differentiable."""
+    for axis, size in enumerate(shape):
+        taps = interpolation(size, texture.shape[axis])
+        index = torch.from_numpy(taps.index).to(texture.device)
+        right = torch.from_numpy(taps.weight[:, 1]).to(texture).view(-1, *[1] * (2 - axis))
+        left, far = (texture.index_select(axis, index[:, k]) for k in (0, 1))
+        texture = torch.lerp(left, far, right)
+    return texture
+
+
+def _levels(table: Tensor, packing: Packing) -> list[Tensor]:
+    return [
+        part.view(rows, columns, -1)
+        for part, (rows, columns) in zip(
+            table.split([rows * columns for rows, columns in packing.shapes]), packing.shapes, strict=True
+        )
+    ]
+
+
+def _table(levels: list[Tensor]) -> Tensor:
+    return torch.cat([level.flatten(0, 1) for level in levels])
+
+
+def summed(residuals: Tensor, packing: Packing) -> Tensor:
+    """Texels (texels, channels) of all levels from what each adds to the next coarser one; differentiable."""
+    out: list[Tensor] = []
+    for level, shape in zip(_levels(residuals, packing), packing.shapes, strict=True):
+        out.append(level + enlarged(out[-1], shape) if out else level)
+    return _table(out)
+
+
+def residuals_of(texels: Tensor, packing: Packing) -> Tensor:
+    """Inverse of :func:`summed`."""
+    levels = _levels(texels, packing)
+    finer = [
+        level - enlarged(coarser, shape)
+        for coarser, level, shape in zip(levels, levels[1:], packing.shapes[1:], strict=False)
+    ]
+    return _table([levels[0], *finer])
