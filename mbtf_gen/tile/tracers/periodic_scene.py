@@ -94,7 +94,7 @@ class PeriodicScene(ABC):
         holes: Any = None,
         rng: Any = None,
     ) -> tuple[Mask, UInt32, Mask, Any]:
-        state, rng = self._search(ray, active, max_crossings, holes, rng)
+        state, rng = self._search(ray, active, max_crossings, holes, rng, any_hit=holes is None)
         return state.hit | state.capped, state.crossings, state.capped, rng
 
     def hit_and_shadow(
@@ -118,7 +118,7 @@ class PeriodicScene(ABC):
 
     @dr.syntax
     def _search(
-        self, ray: Ray3f, active: Mask, max_crossings: int, holes: Any, rng: Any
+        self, ray: Ray3f, active: Mask, max_crossings: int, holes: Any, rng: Any, any_hit: bool = False
     ) -> tuple[Search, Any]:
         """Trace rays, box by box, until they hit an opaque point, leave the slab, or reach the cap."""
         d, low, size = ray.d, self.low, self.size
@@ -141,9 +141,12 @@ class PeriodicScene(ABC):
             end = dr.maximum(dr.minimum(to_x, to_y), 0.0)
             segment = mi.Ray3f(dr.fma(d, -back, state.o), d)
             segment.maxt = end + back + self.overlap
-            found = self.scene.ray_intersect_preliminary(segment, coherent=False, active=state.searching)
-            hit = state.searching & found.is_valid()
-            state.at = dr.select(hit, self._located(found, segment), state.at)
+            if dr.hint(any_hit, mode="scalar"):
+                hit = state.searching & self.scene.ray_test(segment, coherent=False, active=state.searching)
+            else:
+                found = self.scene.ray_intersect_preliminary(segment, coherent=False, active=state.searching)
+                hit = state.searching & found.is_valid()
+                state.at = dr.select(hit, self._located(found, segment), state.at)
             state.hit |= hit
             if dr.hint(holes is not None, mode="scalar"):
                 si = self._surface(state.at, d, state.hit)
