@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal, Self
@@ -22,7 +22,7 @@ from mbtf_gen.tile.heights import (
     rms_slope,
     slope_angles,
 )
-from mbtf_gen.tile.inspection import ALBEDO_RANGE, inspection_text, oddities
+from mbtf_gen.tile.inspection import ALBEDO_RANGE, oddities
 from mbtf_gen.tile.maps.checks import Codes, far_off, suggestion_warning
 from mbtf_gen.tile.maps.file_names import Convention
 from mbtf_gen.tile.maps.map_loader import Color, MapFacts
@@ -329,9 +329,6 @@ class HeightFieldTile(Tile):
             "holes": float(np.mean(opacity < 0.5)),
             "partly": float(np.mean((opacity > 0.02) & (opacity < 0.98))),
         }
-
-    def describe(self, found: Mapping[str, Any], name: str) -> str:
-        return inspection_text(found, name)
 
     def summary(self) -> str:
         """Mesh, height scale and displacement range."""
