@@ -18,8 +18,6 @@ from mbtf_gen.tile.reflectance import in_use, lobe_widths, plugin_dictionary
 from mbtf_gen.tile.tracers.protocol import TileGeometry
 
 F64 = NDArray[np.float64]
-# Weights of a part that are described, in words of their roles.
-_TOLD = ("metallic", "clearcoat", "sheen", "opacity")
 # Distance in tile widths within which vertices count as one.
 _SAME = 1e-5
 # Side of the cells that hold one vertex each in this comparison.
