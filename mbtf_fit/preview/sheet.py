@@ -19,9 +19,10 @@ from mbtf_core.color import brightness, chosen_exposure, describe_exposure, to_d
 from mbtf_core.directions import from_angles
 from mbtf_core.files.folders import check_space
 from mbtf_core.pictures import PNG_BYTES, Camera, claim_pictures, write_png
+from mbtf_core.units import tiles_text
 from mbtf_fit.material.format import read_description
 from mbtf_fit.preview.config import MaterialPreviewConfig, SheetSection
-from mbtf_fit.preview.grid import grid, width_label
+from mbtf_fit.preview.grid import grid
 from mbtf_gen.config.pictures import Direction
 from mbtf_gen.engine.runtime import load_mitsuba
 
@@ -55,7 +56,8 @@ def contact_sheet(values: F32, section: SheetSection, exposure: float) -> NDArra
     columns = list(product(section.view, section.light))
     pictures = list(to_display(values, exposure).reshape(len(columns), *values.shape[2:]))
     captions = [f"{_caption('view', view)}\n{_caption('light', light)}" for view, light in columns]
-    return grid(pictures, captions, list(map(width_label, section.tiles_across)), len(section.light))
+    labels = [f"{tiles_text(across)} wide" for across in section.tiles_across]
+    return grid(pictures, captions, labels, len(section.light))
 
 
 def _caption(name: str, direction: Direction) -> str:

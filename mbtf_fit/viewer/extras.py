@@ -19,6 +19,7 @@ from mbtf_core.images.resample import resample
 from mbtf_core.meshes.content import joined
 from mbtf_core.meshes.read import read_mesh_content
 from mbtf_core.pictures import Camera, read_references
+from mbtf_core.units import tiles_text
 from mbtf_fit.material.material import Material
 from mbtf_fit.viewer.page import encode
 from mbtf_fit.viewer.textures import pack
@@ -98,11 +99,6 @@ def poster(material: Material) -> str:
     stream = io.BytesIO()
     Image.fromarray(to_display(value, ALBEDO_EXPOSURE)).save(stream, "jpeg", quality=85)
     return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"
-
-
-def tiles_text(count: float) -> str:
-    """A number of tiles in words."""
-    return "1 tile" if count == 1 else f"{count:g} tiles"
 
 
 def read_shape(path: Path) -> tuple[dict[str, F64], NDArray[np.int64], float]:

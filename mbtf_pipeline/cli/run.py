@@ -307,11 +307,11 @@ def report(
         Folder of the run.
     """
     from mbtf_core.color import describe_exposure
-    from mbtf_pipeline.collection.run import is_collection, write_again
+    from mbtf_pipeline.collection.run import COLLECTION, write_again
     from mbtf_pipeline.run import rerender
 
     used = None
-    if is_collection(folder):
+    if COLLECTION.read(folder) is not None:
         if exposure is not None:
             raise UsageError("the page of several runs has no exposure", where="--exposure")
         path = write_again(folder)

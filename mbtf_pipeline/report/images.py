@@ -28,6 +28,7 @@ from mbtf_core.color import (
     white_of,
 )
 from mbtf_core.stats import local_error
+from mbtf_core.units import tiles_text
 from mbtf_pipeline.compare.image_files import read_halves, read_map, read_picture
 from mbtf_pipeline.compare.offsets import read_offset, towards_view
 from mbtf_pipeline.compare.perceptual_metrics import available_metrics
@@ -41,7 +42,6 @@ from mbtf_pipeline.tables import (
     levels_text,
     short_direction,
     signed,
-    width,
 )
 
 U8 = NDArray[np.uint8]
@@ -203,13 +203,14 @@ def scaled_maps(
 
 
 def _title(comparison: Mapping[str, Any], picture: Mapping[str, Any]) -> str:
-    return f"{width(picture['tiles_across'])}, {levels_text(picture['levels'], comparison['finest'])}"
+    levels = levels_text(picture["levels"], comparison["finest"])
+    return f"{tiles_text(picture['tiles_across'])} across, {levels}"
 
 
 def _block(comparison: Mapping[str, Any], picture: Mapping[str, Any], number: int) -> dict[str, Any]:
     """Figures of one scene: references and fits, side by side; below each fit, its error maps."""
     where = f": view {direction(picture['view'])}, light {direction(picture['light'])}, "
-    where += width(picture["tiles_across"])
+    where += f"{tiles_text(picture['tiles_across'])} across"
     references, fits, kinds = [], [], comparison["kinds"]
     for kind in kinds:
         reference = picture["references"][kind]
@@ -252,7 +253,7 @@ def _scene(comparison: Mapping[str, Any], picture: Mapping[str, Any]) -> dict[st
     ]
     return {
         "where": where + _title(comparison, picture),
-        "tiles_across": width(picture["tiles_across"]),
+        "tiles_across": f"{tiles_text(picture['tiles_across'])} across",
         "references": references,
         "fits": [picture["fits"][fit]["file"] for fit in comparison["fits"]],
     }
