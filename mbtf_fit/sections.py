@@ -159,7 +159,8 @@ class TrainingSection(Settings):
         None,
         gt=0,
         le=1,
-        description="unexplained variance at which training stops: validation error plus its standard error",
+        description="unexplained variance at which training stops: validation error plus its standard "
+        "error; a cost study forecasts the time",
     )
     batch: Annotated[int, Flag("--batch", rare=True)] = Field(
         1 << 15, ge=1, le=1 << 24, description="queries per step"
