@@ -228,13 +228,12 @@ class Dataset:
         listed = self.manifest["splits"].get(split, {"shards": []})["shards"]
         return [ShardEntry(cast(Split, split), i, e["file"], e["rows"]) for i, e in enumerate(listed)]
 
-    def shards(self, split: str, *, finished_only: bool = False) -> list[Shard]:
+    def shards(self, split: str) -> list[Shard]:
         """Shards of a split in order.
 
         Parameters
         ----------
         split : ``train`` or ``test``
-        finished_only : leave out shards that are not rendered yet
 
         Raises
         ------
@@ -252,8 +251,6 @@ class Dataset:
             try:
                 record = read_sidecar(self.folder, entry, self.manifest["config_hash"])
             except InputError as error:
-                if error.what in ABSENT and finished_only:
-                    continue
                 if error.what in ABSENT:
                     raise InputError(
                         f"shard {entry.file} is missing or unfinished",

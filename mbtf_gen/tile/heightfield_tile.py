@@ -161,11 +161,6 @@ class HeightFieldTile(Tile):
         apart = f"its pixels are {facts.pixel_size:.6g} apart"
         return what, f"give --height-scale {scale:.4g}, as {apart}, where heights have the same unit"
 
-    def coarser_grid(self, most: int) -> HeightGrid:
-        if max(self.grid.z.shape) <= most:
-            return self.grid
-        return self.at(mesh=max(1, min(most, int(most / self.aspect)))).grid
-
     @property
     def thickness(self) -> float:
         return self.grid.displacement_range

@@ -85,10 +85,6 @@ class Tile(ABC):
         """The tile at another height scale and resolution of the mesh, where it has them."""
         return self
 
-    def coarser_grid(self, most: int) -> HeightGrid | None:
-        """:attr:`grid`, or a coarser one of at most so many cells along each side."""
-        return None
-
     @abstractmethod
     def trace(self, unit: float, below: bool = False) -> TileGeometry:
         """The surface as rays meet it.
