@@ -15,7 +15,7 @@ from mbtf_core.color import ALBEDO_EXPOSURE, to_display
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError
 from mbtf_core.images.environment import read_environment
-from mbtf_core.images.resample import resample
+from mbtf_core.images.resample import shrink
 from mbtf_core.meshes.content import joined, triangle_areas
 from mbtf_core.meshes.read import read_mesh_content
 from mbtf_core.pictures import Camera, read_references
@@ -62,9 +62,7 @@ def picture_content(
     camera : that of the picture
     light : direction (3,) towards the light
     """
-    rows, columns = value.shape[:2]
-    shrink = max(1, -(-max(rows, columns) // _PICTURE_SIZE))
-    small = resample(value, rows // shrink, columns // shrink) if shrink > 1 else value
+    small = shrink(value, -(-max(value.shape[:2]) // _PICTURE_SIZE))
     return {
         "name": name,
         "camera": {

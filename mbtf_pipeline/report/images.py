@@ -27,6 +27,7 @@ from mbtf_core.color import (
     to_display,
     white_of,
 )
+from mbtf_core.images.resample import shrink
 from mbtf_core.stats import local_error
 from mbtf_core.units import tiles_text
 from mbtf_pipeline.compare.image_files import read_halves, read_map, read_picture
@@ -72,17 +73,6 @@ def color_bar(
         "ticks": ticks,
         "unit": unit,
     }
-
-
-def shrink(values: Pixels, factor: int) -> Pixels:
-    """Average `factor` × `factor` pixels of (rows, columns, ...); incomplete blocks are dropped."""
-    if factor == 1:
-        return values
-    factor = min(factor, *values.shape[:2])
-    rows, columns = (n // factor for n in values.shape[:2])
-    cut = values[: rows * factor, : columns * factor]
-    out: Pixels = cut.reshape(rows, factor, columns, factor, *values.shape[2:]).mean(axis=(1, 3))
-    return out
 
 
 def data_uri(display: U8, kind: Literal["png", "jpeg"] = "png", colors: Palette | None = None) -> str:

@@ -12,12 +12,13 @@ import numpy as np
 
 from mbtf_core.color import linear_to_srgb
 from mbtf_core.errors import MbtfError
+from mbtf_core.images.resample import shrink
 from mbtf_core.stats import Estimate
 from mbtf_fit.formatting import SPLIT_NAMES
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.tile.inspection import brief_warnings, inspection_text
 from mbtf_gen.tile.loading import latest_material
-from mbtf_pipeline.report.images import U8, Pixels, data_uri, shrink
+from mbtf_pipeline.report.images import U8, Pixels, data_uri
 from mbtf_pipeline.report.plots import Series, plot, points
 from mbtf_pipeline.stages import FITS, read_stamp
 from mbtf_pipeline.tables import NOT_SIGNIFICANT, data_errors, estimate, is_significant
