@@ -1,5 +1,4 @@
-"""Forecasts of time: a short pilot on this machine, its error, and its extrapolation to the whole work; and
-the words for forecasts of the error."""
+"""Forecasts of time: a short pilot on this machine, its error, and its extrapolation to the whole work."""
 
 from __future__ import annotations
 
@@ -13,8 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from mbtf_core.run.task import available_cores, worker_threads
-from mbtf_core.stats import Estimate, Interval
-from mbtf_core.units import clock
+from mbtf_core.stats import Estimate
 
 # Fewest timed pieces of a pilot.
 FEWEST_PIECES = 3
@@ -22,8 +20,6 @@ FEWEST_PIECES = 3
 LONG, LARGE = 60.0, 1e9
 # Wall time of a probe of the processors, seconds, and bytes of its steps, which run without Python's lock.
 _PROBE_SECONDS, _PROBE_BYTES = 0.05, 1 << 20
-# Said where the bounds of a forecast are too far apart to plan by.
-INSUFFICIENT = "the evidence does not suffice"
 
 
 def pilot_seconds(piece: Callable[[int], float], seconds: float) -> Estimate:
@@ -65,27 +61,3 @@ def processor_share() -> float:
 def is_long(seconds: float, size: float) -> bool:
     """Whether work of so many seconds, or of so many bytes on disk, is announced before it begins."""
     return seconds >= LONG or size >= LARGE
-
-
-def expected_error(seconds: float, error: Interval) -> str:
-    """What a time is expected to give, in one line; `error` is an unexplained variance."""
-    if error.suffices:
-        return f"{clock(seconds)}: expect an unexplained variance of {error}"
-    return f"{clock(seconds)}: {INSUFFICIENT}"
-
-
-def expected_seconds(
-    error: float, seconds: Interval, limit: Interval, why: str, *, within: float = math.inf
-) -> str:
-    """How long an error is expected to take, in one line: the time that reaches an unexplained variance, the
-    limit that no time undercuts, and why, such as ``with these queries``. `within` is a time whose error is
-    at most this one even at its upper bound; infinite where none is known."""
-    if seconds.suffices:
-        span = f"{clock(seconds.low)} to {clock(seconds.high)}"
-        return f"error {error:g}: about {clock(seconds.value)} ({span})"
-    if within < math.inf:
-        return f"error {error:g}: reached within {clock(within)}"
-    if seconds.low == math.inf:
-        return f"error {error:g}: not reachable {why}: they limit it at about {limit}"
-    least = f", but it takes at least {clock(seconds.low)}" if seconds.low >= 1.0 else ""
-    return f"error {error:g}: {INSUFFICIENT}{least}"

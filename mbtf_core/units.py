@@ -109,6 +109,11 @@ def parse_numbers(value: Any) -> Any:
         raise ValueError("must be numbers separated by commas, such as 1,2,4") from None
 
 
+def tiles_text(count: float) -> str:
+    """``1 tile``, ``2.5 tiles``."""
+    return "1 tile" if count == 1 else f"{count:g} tiles"
+
+
 def clock(seconds: float) -> str:
     """Readable duration: ``0:07``, ``12:03``, ``1:02:03``."""
     whole = max(0, round(seconds))

@@ -32,11 +32,12 @@ from mbtf_core.files.folders import OutputFolder, owned
 from mbtf_core.pictures import claim_pictures, write_png
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.stats import local_error, noise_free_mse, signal_variance, unexplained_variance
+from mbtf_core.units import tiles_text
 from mbtf_fit.evaluation import check_aspect, foreign_inputs
 from mbtf_fit.formatting import format_estimate, visibility
 from mbtf_fit.material.material import Material
 from mbtf_fit.preview.config import ComparisonConfig
-from mbtf_fit.preview.grid import color_bar, grid, width_label, with_bar
+from mbtf_fit.preview.grid import color_bar, grid, with_bar
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_gen.pictures.reference import (
@@ -137,7 +138,7 @@ def compare(config: ComparisonConfig, output: Path, console: Console, *, overwri
         if found["mean_ratio"] is not None:
             seen.append(f"mean {found['mean_ratio']:.3f} of the reference's")
         of = f"reference: contrast {found['contrast']:.1%}, noise {facts['relative_noise']:.1%}"
-        lines.append(f"{width_label(across)}: {', '.join(seen)}; {of}")
+        lines.append(f"{tiles_text(across)} wide: {', '.join(seen)}; {of}")
     lines.append(
         "% of the mean value; unexplained variance is (RMS error / contrast)², large where contrast is low"
     )
@@ -204,7 +205,7 @@ def _draw(
     ]
     path = folder.path / PICTURE_NAME
     shown = [[_enlarged(picture) for picture in column] for column in columns]
-    sheet = grid(shown, captions, list(map(width_label, widths)), 3)
+    sheet = grid(shown, captions, [f"{tiles_text(across)} wide" for across in widths], 3)
     write_png(path, with_bar(sheet, color_bar(size * times, "local", 100.0 * scale, "%")))
     folder.keep(PICTURE_NAME, [path], {"exposure": exposure})
     return errors

@@ -160,7 +160,7 @@ class TrainingSection(Settings):
         gt=0,
         le=1,
         description="unexplained variance at which training stops: validation error plus its standard "
-        "error; forecasts state the time",
+        "error; a cost study forecasts the time",
     )
     batch: Annotated[int, Flag("--batch", rare=True)] = Field(
         1 << 15, ge=1, le=1 << 24, description="queries per step"

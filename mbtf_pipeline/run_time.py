@@ -13,7 +13,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from types import MappingProxyType
 
 from mbtf_core.app.options import Quality
 from mbtf_core.errors import InputError, UsageError
@@ -98,10 +97,8 @@ class RunForecaster:
         recipe: Recipe,
         stages: Collection[str] | None = None,
         speed: tuple[float, float] | None = None,
-        training: Mapping[str, float] = MappingProxyType({}),
     ) -> RunForecast:
-        """Forecast of some stages of a recipe of this material, by default of all, at the pilot's speed;
-        `training`: seconds of the fits whose steps have been timed."""
+        """Forecast of some stages of a recipe of this material, by default of all, at the pilot's speed."""
         from mbtf_fit.training.forecast import closing_seconds, fit_bytes, preparing_seconds
         from mbtf_gen.job import data_bytes
 
@@ -121,16 +118,15 @@ class RunForecaster:
             traced = pixels * len(compare.kinds)
             comparing = _COMPARE + traced * compare.spp * path
             size += traced * _REFERENCE_BYTES + pixels * len(recipe.fit) * _FIT_BYTES
-        untimed = {name: fit.training for name, fit in fits.items() if name not in training}
-        by_time = [budget.time for budget in untimed.values() if budget.steps is None]
+        by_time = [fit.training.time for fit in fits.values() if fit.training.steps is None]
         return RunForecast(
             start=_START + (start if paths else 0.0),
             generating=paths * path,
-            training=sum(training.values()) + sum(budget.seconds for budget in by_time),
+            training=sum(budget.seconds for budget in by_time),
             evaluating=len(fits) * (preparing_seconds(queries) + closing_seconds(queries)),
             comparing=comparing,
             bytes=size,
-            by_steps=tuple(name for name, budget in untimed.items() if budget.steps is not None),
+            by_steps=tuple(name for name, fit in fits.items() if fit.training.steps is not None),
             min_steps=max((budget.min_steps for budget in by_time), default=0),
         )
 

@@ -74,11 +74,6 @@ def short_direction(d: Mapping[str, float]) -> str:
     return signed(f"{d['elevation']:g}° / {d['azimuth']:g}°")
 
 
-def width(tiles_across: float) -> str:
-    """Width of the field of view."""
-    return f"{tiles_across:g} tile{'' if tiles_across == 1 else 's'} across"
-
-
 def levels_text(found: list[float], finest: int) -> str:
     """Range of levels in an image, and whether the data contain them."""
     low, high = (f"{level:.1f}" for level in found)

@@ -67,7 +67,7 @@ def main() -> None:
     """Write the pictures."""
     ball()
     first_comparison()
-    sheet = run("fit", f"preview {TURTLE_SHELL} --sheet-only", "sheet")
+    sheet = run("fit", f"preview {TURTLE_SHELL}", "sheet")
     save(Image.open(sheet / "sheet.png"), "sheet")
 
 

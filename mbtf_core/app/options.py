@@ -77,7 +77,7 @@ ErrorOption = Annotated[
         name="--error",
         metavar="FLOAT",
         help="Unexplained variance at which training stops: validation error plus its standard error; "
-        "forecasts state the time.",
+        "a cost study forecasts the time.",
     ),
 ]
 

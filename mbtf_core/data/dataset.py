@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -22,8 +22,6 @@ from mbtf_core.files.atomic import file_sha256
 from mbtf_core.paths import suggest_path
 
 _MAKE_AGAIN = "generate or download the data set again"
-# Shards that are downloaded ahead of their reader.
-_AHEAD = 2
 # Times that a shard is downloaded again because it has left the cache.
 _READS = 8
 # The sidecar's mean and that of the shard are float64 sums in different orders.
@@ -71,10 +69,6 @@ class Shard:
         PartialError : its store cannot be reached, or the disk is full
         """
         return self.folder.file(self.file, str(self.sidecar["sha256"]), int(self.sidecar["bytes"]))
-
-    def prefetch(self) -> None:
-        """Start to download it in the background if it is in a store."""
-        self.folder.prefetch(self.file, str(self.sidecar["sha256"]))
 
     def map(self, names: Iterable[str] | None = None) -> Arrays:
         """Its arrays, memory-mapped if the format allows, their numbers unchecked; see :meth:`read`."""
@@ -125,14 +119,6 @@ class Shard:
             if np.abs(mean - stated).max() > _SAME_MEAN * np.abs(stated).max():
                 raise InputError("is not the shard that its sidecar describes", where=self.where, hint=hint)
         return arrays
-
-
-def ahead(shards: Sequence[Shard]) -> Iterator[Shard]:
-    """Shards in order, of which the next ones are downloaded ahead if they are in a store."""
-    for index, shard in enumerate(shards):
-        for following in shards[index + 1 : index + 1 + _AHEAD]:
-            following.prefetch()
-        yield shard
 
 
 def is_dataset(folder: str | Path | DataFolder) -> bool:
@@ -242,13 +228,12 @@ class Dataset:
         listed = self.manifest["splits"].get(split, {"shards": []})["shards"]
         return [ShardEntry(cast(Split, split), i, e["file"], e["rows"]) for i, e in enumerate(listed)]
 
-    def shards(self, split: str, *, finished_only: bool = False) -> list[Shard]:
+    def shards(self, split: str) -> list[Shard]:
         """Shards of a split in order.
 
         Parameters
         ----------
         split : ``train`` or ``test``
-        finished_only : leave out shards that are not rendered yet
 
         Raises
         ------
@@ -266,8 +251,6 @@ class Dataset:
             try:
                 record = read_sidecar(self.folder, entry, self.manifest["config_hash"])
             except InputError as error:
-                if error.what in ABSENT and finished_only:
-                    continue
                 if error.what in ABSENT:
                     raise InputError(
                         f"shard {entry.file} is missing or unfinished",
@@ -326,7 +309,7 @@ class Dataset:
         InputError : see :meth:`shards` and :meth:`Shard.read`
         """
         wanted = None if names is None else [names] if isinstance(names, str) else list(names)
-        yield from (shard.read(wanted) for shard in ahead(self.shards(split)))
+        yield from (shard.read(wanted) for shard in self.shards(split))
 
     def load(self, split: str = "train", names: Iterable[str] | None = None) -> Arrays:
         """All queries of a split in memory: ``Dataset.open("small").load("test")``.

@@ -7,7 +7,7 @@ import hashlib
 import os
 import threading
 import time
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
@@ -34,8 +34,8 @@ class FileCache:
     def __init__(self, folder: Path, limit: float = CACHE_BYTES) -> None:
         self.folder = folder
         self.limit = limit
-        self._guard = threading.Lock()
-        self._locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
+        # A thread may read the next batch while another one reads a shard.
+        self._lock = threading.Lock()
         self._recent: deque[str] = deque(maxlen=_KEPT)
         # Files whose digest this process has checked, as they were then.
         self._checked: dict[str, tuple[int, ...]] = {}
@@ -45,14 +45,10 @@ class FileCache:
         InputError where that has another digest, a PartialError where the disk is full, or an error of
         `read`."""
         path = self.folder / f"{sha256}{suffix}"
-        with self._guard:
-            lock = self._locks[path.name]
-        # Another thread may be reading it.
-        with lock:
-            with self._guard:
-                if path.name in self._recent:
-                    self._recent.remove(path.name)
-                self._recent.append(path.name)
+        with self._lock:
+            if path.name in self._recent:
+                self._recent.remove(path.name)
+            self._recent.append(path.name)
             with contextlib.suppress(OSError):
                 if path.stat().st_size == size and self._is_intact(path, sha256):
                     # Its age is the time since it was used.
@@ -74,25 +70,24 @@ class FileCache:
 
     def _make_room(self, size: int) -> None:
         """Remove files until `size` bytes more fit."""
-        with self._guard:
-            found: list[tuple[float, int, str]] = []
-            with contextlib.suppress(OSError), os.scandir(self.folder) as entries:
-                for entry in entries:
-                    with contextlib.suppress(OSError):
-                        stat = entry.stat()
-                        found.append((stat.st_mtime, stat.st_size, entry.name))
-            total = size + sum(bytes_ for _, bytes_, _ in found)
-            now = time.time()
-            for used, bytes_, name in sorted(found):
-                if name.startswith("."):
-                    removed = now - used > _ABANDONED_SECONDS
-                else:
-                    removed = total > self.limit and name not in self._recent
-                if not removed:
-                    continue
+        found: list[tuple[float, int, str]] = []
+        with contextlib.suppress(OSError), os.scandir(self.folder) as entries:
+            for entry in entries:
                 with contextlib.suppress(OSError):
-                    os.unlink(self.folder / name)
-                    total -= bytes_
+                    stat = entry.stat()
+                    found.append((stat.st_mtime, stat.st_size, entry.name))
+        total = size + sum(bytes_ for _, bytes_, _ in found)
+        now = time.time()
+        for used, bytes_, name in sorted(found):
+            if name.startswith("."):
+                removed = now - used > _ABANDONED_SECONDS
+            else:
+                removed = total > self.limit and name not in self._recent
+            if not removed:
+                continue
+            with contextlib.suppress(OSError):
+                os.unlink(self.folder / name)
+                total -= bytes_
 
 
 def _state(path: Path) -> tuple[int, ...]:

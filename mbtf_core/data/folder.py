@@ -15,7 +15,6 @@ import hashlib
 import os
 import re
 import tempfile
-import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -25,7 +24,7 @@ from typing import Any
 from mbtf_core.data.file_cache import FileCache
 from mbtf_core.data.schema import CONFIG_NAME, GEOMETRY_NAME, MANIFEST_NAME, SPLITS
 from mbtf_core.data.store import LocalStore, Store, StoredFile, open_store
-from mbtf_core.errors import InputError, MbtfError, PartialError, check_type, unwritable
+from mbtf_core.errors import InputError, PartialError, check_type, unwritable
 from mbtf_core.files.atomic import (
     TEMPORARY,
     Stored,
@@ -46,9 +45,8 @@ _OWN = re.compile(rf"{_DOCUMENTS}|{_SHARD}\.(?:npz|exr|json)")
 _KEPT = re.compile(rf"{_SIDECAR.pattern}|{_DOCUMENTS}")
 _UNFINISHED = re.compile(rf"\.({_OWN.pattern}){TEMPORARY}")
 _LOCK = re.compile(rf"\.({_SHARD}|{re.escape(Path(MANIFEST_NAME).stem)})\.lock")
-# Small files, and shards to be read next, that are downloaded at once; shards that must fit into a cache for
-# others to be downloaded ahead.
-_THREADS, _AHEAD, _ROOM = 16, 2, 16
+# Small files that are downloaded at once.
+_THREADS = 16
 
 
 def is_leftover(name: str) -> bool:
@@ -82,9 +80,6 @@ class DataFolder:
         # Of a store: its files as last seen, and the contents of the small ones.
         self._listed: dict[str, StoredFile] = {}
         self._contents: dict[str, bytes] = {}
-        # Shards that are downloaded ahead of their readers.
-        self._coming: set[tuple[str, str]] = set()
-        self._slots = threading.Semaphore(_AHEAD)
 
     @classmethod
     def open(cls, where: str | Path | DataFolder) -> DataFolder:
@@ -215,22 +210,6 @@ class DataFolder:
             except OSError as error:
                 raise unwritable(path, error) from None
             yield path
-
-    def prefetch(self, name: str, sha256: str) -> None:
-        """Start to download a shard of a store in a background thread; nothing happens for local files.
-        Failures are left to the reader. A cache of a few shards has no room for it."""
-        if self.local is not None or _ROOM * (self.size(name) or 0) > self.cache.limit:
-            return
-        if (name, sha256) not in self._coming:
-            self._coming.add((name, sha256))
-            # As a daemon it does not delay the exit.
-            reader = threading.Thread(None, self._read_ahead, "prefetch", (name, sha256), daemon=True)
-            reader.start()
-
-    def _read_ahead(self, name: str, sha256: str) -> None:
-        with self._slots, contextlib.suppress(MbtfError):
-            self.file(name, sha256)
-        self._coming.discard((name, sha256))
 
     def write(self, name: str, content: bytes, *, new: bool = False) -> bool:
         """Write a document whole; False where `new`, and another writer's is there. A PartialError where the

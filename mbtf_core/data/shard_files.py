@@ -216,15 +216,16 @@ def _fold(array: NDArray[np.float32], lead: tuple[int, ...]) -> NDArray[np.float
     return array.reshape(-1, width, *trailing)
 
 
-def write_exr(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
-    """Write a shard as one EXR image with a named float32 channel per component, atomically.
+def write_exr(path: Path, arrays: Mapping[str, NDArray[np.float32]], *, complete: bool = True) -> Stored:
+    """Write a shard, of all arrays if `complete`, as one EXR image with a named float32 channel per
+    component, atomically.
 
     The header's string ``mbtf.lead`` holds the leading axes: "n", "items,rows,columns" or
     "items,directions".
     """
     from mbtf_core.images.exr import write_channels
 
-    lead = check_arrays(arrays, path)
+    lead = check_arrays(arrays, path, complete=complete)
     channels: dict[str, Any] = {}
     for spec in (a for a in ARRAYS if a.name in arrays):
         image = _fold(np.asarray(arrays[spec.name], np.float32), lead)

@@ -39,6 +39,12 @@ def resample(
     return out
 
 
+def shrink(image: NDArray[np.floating[Any]], factor: int) -> NDArray[np.floating[Any]]:
+    """Average about `factor` × `factor` texels of a map (H, W, ...), at most all of its rows or columns."""
+    rows, columns = (max(1, n // factor) for n in image.shape[:2])
+    return resample(image, rows, columns)
+
+
 def _weights(old: int, new: int, enlarge: Enlargement) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Old texels (new, taps) that each new texel takes, and their weights (new, taps), rows summing to 1."""
     if new < old:

@@ -113,6 +113,14 @@ class MeshContent:
     warnings: list[str] = field(default_factory=list)
 
 
+def triangle_areas(points: F64, faces: NDArray[np.int64]) -> F64:
+    """Areas of triangles in space, or signed ones in the plane."""
+    a, b = (points[faces[:, k]] - points[faces[:, 0]] for k in (1, 2))
+    if points.shape[1] == 2:
+        return 0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    return 0.5 * np.linalg.norm(np.cross(a, b), axis=1)
+
+
 def groups_of(key: I64) -> list[I64]:
     """Indices that share a value, for each of the values in ascending order."""
     order = np.argsort(key, kind="stable")

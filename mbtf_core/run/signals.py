@@ -185,14 +185,6 @@ def raising() -> Iterator[None]:
         _State.raising = False
 
 
-def reinstall_handlers() -> None:
-    """Install Python's handlers again. After rendering with an integrator that is written in Python, Mitsuba
-    leaves its own one behind, which ignores SIGINT: the inner of nested handlers restores the outer one."""
-    for number in SIGNALS if _in_main_thread() else ():
-        if callable(handler := signal.getsignal(number)):
-            signal.signal(number, handler)
-
-
 @contextlib.contextmanager
 def stop_on_interruption() -> Iterator[threading.Event]:
     """An event that the first signal sets, instead of an exception, so that work ends after its current step;

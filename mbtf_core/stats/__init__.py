@@ -14,7 +14,6 @@ from mbtf_core.stats.estimate import (
 )
 from mbtf_core.stats.learning_curve import Interval, LearningCurve
 from mbtf_core.stats.paired import (
-    LOCAL_WINDOW,
     local_error,
     mean_of_halves,
     mse_difference,
@@ -28,7 +27,6 @@ from mbtf_core.stats.paired import (
 )
 
 __all__ = [
-    "LOCAL_WINDOW",
     "Estimate",
     "Interval",
     "LearningCurve",

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from mbtf_core.stats.estimate import Estimate, checked, mean_estimate, per_unit, standard_error, unit_weights
 
 # Standard deviation, in pixels, of the averaging window of local errors.
-LOCAL_WINDOW = 2.0
+_LOCAL_WINDOW = 2.0
 
 
 def _pair(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -271,20 +271,17 @@ def _root(estimate: Estimate) -> Estimate:
     return Estimate(value, error, estimate.n, estimate.dof)
 
 
-def local_error(
-    prediction: ArrayLike, a: ArrayLike, b: ArrayLike, window: float = LOCAL_WINDOW
-) -> NDArray[np.float64]:
+def local_error(prediction: ArrayLike, a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
     """Local noise-free root mean square error of a picture, in the values' unit.
 
-    The root of the Gaussian average of the mean over channels of ``(p-a)(p-b)``. Single products are often
-    negative where the error is small compared to the noise, so they are averaged. The map is 0 where the
-    average is negative: the error lies below the noise.
+    The root of the Gaussian average, σ two pixels, of the mean over channels of ``(p-a)(p-b)``. Single
+    products are often negative where the error is small compared to the noise, so they are averaged. The map
+    is 0 where the average is negative: the error lies below the noise.
 
     Parameters
     ----------
     prediction, a, b : (rows, columns, channels) array_like
         A picture, and the two independent estimates of its reference.
-    window : standard deviation of the average, in pixels
 
     Returns
     -------
@@ -293,5 +290,5 @@ def local_error(
     from scipy.ndimage import gaussian_filter
 
     p, first, second = _with_prediction(prediction, a, b)
-    squared = gaussian_filter(((p - first) * (p - second)).mean(axis=-1), window, mode="nearest")
+    squared = gaussian_filter(((p - first) * (p - second)).mean(axis=-1), _LOCAL_WINDOW, mode="nearest")
     return np.sqrt(np.maximum(squared, 0.0))

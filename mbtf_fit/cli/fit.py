@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -121,7 +122,7 @@ def fit(
     from mbtf_fit.training.forecast import forecast_fit
 
     expected = forecast_fit(config, folder)
-    data = {"shards": str(folder), "model": config.model, "forecast": expected.as_dict()}
+    data = {"shards": str(folder), "model": config.model, "forecast": asdict(expected)}
     console.report(data, expected.describe())
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import Options, Output, Overwrite, PathText, Switch, options_from
+from mbtf_core.app.options import Options, Output, Overwrite, PathText, options_from
 from mbtf_core.errors import UsageError
 from mbtf_fit.preview.config import MaterialPreviewConfig
 
@@ -21,21 +21,18 @@ def preview(
     *,
     output: Output = Path("preview"),
     options: MaterialPreviewOptions = MaterialPreviewOptions(),  # noqa: B008
-    sheet_only: Switch = False,
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Draw a contact sheet and a turntable of a material.
+    """Draw a contact sheet of a material.
 
-    Needs neither a scene nor PyTorch. Writes sheet.png and turntable.gif. --view and --light replace all
-    views and lights of the sheet. Sheet and turntable have one exposure.
+    Needs neither a scene nor PyTorch. Writes sheet.png. --view and --light replace all its views and
+    lights.
 
     Parameters
     ----------
     material
         Folder made by mbtf-fit.
-    sheet_only
-        Draw no turntable.
     """
     from mbtf_core.files.folders import owned
     from mbtf_fit.preview.sheet import draw
@@ -44,4 +41,4 @@ def preview(
         raise UsageError("no material given", hint="mbtf-fit preview material/ -o preview/")
     config = options.resolve(material=material)
     with owned(output):
-        draw(config, output, sheet_only=sheet_only, overwrite=overwrite, console=console)
+        draw(config, output, overwrite=overwrite, console=console)

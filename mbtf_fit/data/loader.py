@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mbtf_core.data.dataset import Dataset, Shard, ahead
+from mbtf_core.data.dataset import Dataset, Shard
 from mbtf_core.data.schema import Split
 from mbtf_core.errors import InputError
 from mbtf_fit.data.layouts import TrainingImages, TrainingSlices, nearest_shapes, philox, strides
@@ -147,7 +147,7 @@ def load_training(
     kept_out: tuple[list[ShardQueries], list[ShardQueries]] = ([], [])
     sample: list[ShardQueries] = []
     selection, lights = Selection(), data.lights_per_path("train")
-    for index, shard in enumerate(ahead(shards)):
+    for index, shard in enumerate(shards):
         queries = read_checked(shard)
         labels = label_queries(held_out, queries, seed, index, lights)
         if lights > 1:
@@ -198,7 +198,7 @@ def _load_images(data: Dataset, shards: list[Shard], held_out: HeldOutSection, s
     sample: list[ShardQueries] = []
     selection = Selection()
     read = 0
-    for shard in ahead(shards):
+    for shard in shards:
         images = read_checked(shard)
         mine = labels[read : read + len(images)]
         read += len(images)
@@ -239,7 +239,7 @@ def _load_slices(data: Dataset, shards: list[Shard], held_out: HeldOutSection, s
     kept_out: tuple[list[ShardQueries], list[ShardQueries]] = ([], [])
     sample: list[ShardQueries] = []
     selection = Selection()
-    for shard in ahead(shards):
+    for shard in shards:
         slices = read_checked(shard)
         if (slices.omega_i != light).any() or (slices.omega_o != view).any():
             raise InputError("its slices do not share their directions", where=shard.where)
@@ -276,7 +276,7 @@ def load_split(data: Dataset, split: Split) -> ShardQueries:
     ------
     InputError : no such split, no queries in it, NaN or infinity, corrupt shards
     """
-    parts = [read_checked(shard).flat() for shard in ahead(data.shards(split))]
+    parts = [read_checked(shard).flat() for shard in data.shards(split)]
     if not sum(map(len, parts)):
         raise InputError(f"its {split} split has no queries", where=data.folder)
     return ShardQueries.join(parts)

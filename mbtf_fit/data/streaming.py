@@ -6,7 +6,6 @@ that the fit does not depend on where the data lie.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
@@ -21,8 +20,6 @@ from mbtf_fit.data.queries import TrainingQueries, batch_starts, mean_value, nee
 
 # Rows of a shard between two cumulative counts of selected rows.
 _BLOCK = 4096
-# Batches whose shards are downloaded ahead.
-_AHEAD = 6
 
 
 class Selection:
@@ -43,11 +40,6 @@ class Selection:
 
     def __len__(self) -> int:
         return self.starts[-1]
-
-    @property
-    def in_store(self) -> bool:
-        """Whether the shards are in an object store."""
-        return any(shard.folder.local is None for shard in self.shards)
 
     def add(self, shard: Shard, chosen: NDArray[np.bool_]) -> None:
         """Append a shard with a mask of its selected rows."""
@@ -110,9 +102,8 @@ class StreamedQueries:
         return TrainingQueries(**{k: torch.from_numpy(v) for k, v in joined.items()}).to(self.device)
 
     def batches(self, size: int, seed: int, step: int, margin: int = 0) -> Iterator[TrainingQueries]:
-        """As :meth:`TrainingQueries.batches`; a thread reads the next batch in the meantime. Shards of object
-        stores are downloaded several batches ahead."""
-        starts = self._announced(batch_starts(len(self), size, seed, step), size)
+        """As :meth:`TrainingQueries.batches`; a thread reads the next batch in the meantime."""
+        starts = batch_starts(len(self), size, seed, step)
         with ThreadPoolExecutor(1) as reader:
             first = next(starts)
             waiting = reader.submit(self.slice, first, first + size)
@@ -120,16 +111,3 @@ class StreamedQueries:
                 batch = waiting.result()
                 waiting = reader.submit(self.slice, start, start + size)
                 yield batch
-
-    def _announced(self, starts: Iterator[int], size: int) -> Iterator[int]:
-        """The same starts; the shards of later ones are announced to their store."""
-        if not self.selection.in_store:
-            yield from starts
-            return
-        coming: deque[int] = deque()
-        for start in starts:
-            for shard, _ in self.selection.pieces(start, start + size):
-                shard.prefetch()
-            coming.append(start)
-            if len(coming) > _AHEAD:
-                yield coming.popleft()

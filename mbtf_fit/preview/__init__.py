@@ -1,1 +1,1 @@
-"""``mbtf-fit preview``: a contact sheet and a turntable of a fitted material, without a scene."""
+"""``mbtf-fit preview``: a contact sheet of a fitted material, without a scene."""

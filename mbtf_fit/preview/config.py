@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Self
 
-import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
 from mbtf_core.app.options import Flag
@@ -23,16 +22,11 @@ from mbtf_gen.config.pictures import (
     ViewSection,
 )
 
-# Limits the memory of sheet and turntable to a gigabyte.
+# Limits the memory of the sheet to a gigabyte.
 MOST_PIXELS = 1 << 25
 # Of a comparison: texels across a pixel, and paths per pixel.
 _TEXELS = (1, 2, 4)
 _SPP, _FIBER_SPP = 256, 64
-# The ball's diameter in widths of the turntable; pixels that a texel covers on it, and its fewest and most
-# tiles by default.
-BALL_WIDTH = 0.46
-_TEXEL_PIXELS = 2
-_TILES_AROUND = (3, 8)
 
 
 def _listed(value: Any) -> Any:
@@ -72,40 +66,18 @@ class SheetSection(Settings):
     )
 
 
-class TurntableSection(Settings):
-    """A rotating ball on a plate."""
-
-    size: Annotated[int, Flag("--turn-size")] = Field(
-        400, ge=16, le=2048, description="pixels along each side of the turntable"
-    )
-    frames: Annotated[int, Flag("--frames")] = Field(18, ge=1, le=360, description="frames of the turntable")
-    spp: Annotated[int, Flag("--spp")] = Field(4, ge=1, le=65536, description="paths per pixel")
-    tiles: Annotated[int | None, Flag("--tiles-around")] = Field(
-        None,
-        ge=1,
-        le=1000,
-        description="tiles around the equator; default: 3 to 8, so that a texel covers about 2 pixels",
-    )
-
-    def tiles_around(self, resolution: int) -> int:
-        """Tiles around the equator of a material with so many texels across."""
-        fine = round(np.pi * BALL_WIDTH * self.size / (_TEXEL_PIXELS * resolution))
-        return self.tiles or min(max(fine, _TILES_AROUND[0]), _TILES_AROUND[1])
-
-
 class MaterialPreviewConfig(Settings):
     """Every option of ``mbtf-fit preview``."""
 
     material: str = Field(description="folder made by mbtf-fit")
     sheet: SheetSection = SheetSection()
-    turntable: TurntableSection = TurntableSection()
     exposure: Exposure = Field(ALBEDO_EXPOSURE, description=EXPOSURE)
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
-        sheet, turn = self.sheet, self.turntable
+        sheet = self.sheet
         panels = len(sheet.view) * len(sheet.light) * len(sheet.tiles_across)
-        if max(panels * sheet.size**2, turn.frames * turn.size**2) > MOST_PIXELS:
+        if panels * sheet.size**2 > MOST_PIXELS:
             raise ValueError(f"asks for more than {MOST_PIXELS:,} pixels; use smaller or fewer pictures")
         return self
 

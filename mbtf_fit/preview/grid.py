@@ -74,11 +74,6 @@ def with_bar(sheet: U8, bar: U8) -> U8:
     return np.concatenate([sheet, footer])
 
 
-def width_label(tiles_across: float) -> str:
-    """Label of the pictures of a width of the field of view."""
-    return f"{tiles_across:g} tile{'' if tiles_across == 1 else 's'} wide"
-
-
 def _label(draw: ImageDraw.ImageDraw, corner: tuple[int, int], text: str, font: Any) -> None:
     """Text in the lower left corner of a picture, on a white background."""
     left, bottom = corner

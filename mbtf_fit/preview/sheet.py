@@ -1,5 +1,5 @@
-"""The pictures of ``mbtf-fit preview``, and the contact sheet: a plane of the material for several views,
-lights and widths of the field of view.
+"""The contact sheet of ``mbtf-fit preview``: a plane of the material for several views, lights and widths of
+the field of view.
 
 A pixel is the material's value M for a single query, as in ``mbtf-gen reference --kind query``; the light has
 unit irradiance on the plane.
@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from mbtf_core.app.console import Console
 from mbtf_core.color import brightness, chosen_exposure, describe_exposure, to_display
 from mbtf_core.directions import from_angles
-from mbtf_core.files.folders import OutputFolder, check_space
+from mbtf_core.files.folders import check_space
 from mbtf_core.pictures import PNG_BYTES, Camera, claim_pictures, write_png
-from mbtf_core.run.signals import keep_on_interruption
-from mbtf_fit.material.format import lattice_of, read_description
+from mbtf_core.units import tiles_text
+from mbtf_fit.material.format import read_description
 from mbtf_fit.preview.config import MaterialPreviewConfig, SheetSection
-from mbtf_fit.preview.grid import grid, width_label
+from mbtf_fit.preview.grid import grid
 from mbtf_gen.config.pictures import Direction
 from mbtf_gen.engine.runtime import load_mitsuba
 
@@ -56,90 +56,54 @@ def contact_sheet(values: F32, section: SheetSection, exposure: float) -> NDArra
     columns = list(product(section.view, section.light))
     pictures = list(to_display(values, exposure).reshape(len(columns), *values.shape[2:]))
     captions = [f"{_caption('view', view)}\n{_caption('light', light)}" for view, light in columns]
-    return grid(pictures, captions, list(map(width_label, section.tiles_across)), len(section.light))
+    labels = [f"{tiles_text(across)} wide" for across in section.tiles_across]
+    return grid(pictures, captions, labels, len(section.light))
 
 
 def _caption(name: str, direction: Direction) -> str:
     return f"{name} el. {direction.elevation:g}°, az. {direction.azimuth:g}°"
 
 
-SHEET_NAME, GIF_NAME = "sheet.png", "turntable.gif"
+SHEET_NAME = "sheet.png"
 
 
-def draw(
-    config: MaterialPreviewConfig, path: Path, *, sheet_only: bool, overwrite: bool, console: Console
-) -> None:
-    """Draw the pictures that are missing and report them, in a folder that this process owns.
+def draw(config: MaterialPreviewConfig, path: Path, *, overwrite: bool, console: Console) -> None:
+    """Draw the sheet if it is missing and report it, in a folder that this process owns.
 
     Raises
     ------
     InputError : the material cannot be used, or the folder holds something else
     UsageError : a view shows the horizon
     """
-    keep_on_interruption(f"the finished pictures are kept in {path}")
-    sheet, turn, asked = config.sheet, config.turntable, config.exposure
+    sheet = config.sheet
     counts = len(sheet.view), len(sheet.light), len(sheet.tiles_across)
-    pixels = counts[0] * counts[1] * counts[2] * sheet.size**2
-    pixels += 0 if sheet_only else turn.frames * turn.size**2
-    check_space(path, PNG_BYTES * pixels, "reduce --size or --frames, or choose another folder with -o")
+    size = PNG_BYTES * counts[0] * counts[1] * counts[2] * sheet.size**2
+    check_space(path, size, "reduce --size, or choose another folder with -o")
     description, _ = read_description(Path(config.material))
     folder = claim_pictures(
         path,
         "mbtf-fit preview",
-        files=(SHEET_NAME, GIF_NAME),
+        files=[SHEET_NAME],
         config=config.model_dump(mode="json"),
         inputs={"weights": description["weights"]["sha256"]},
         overwrite=overwrite,
     )
-    shows = {SHEET_NAME: "{} views x {} lights (columns) x {} zooms (rows)".format(*counts)}
-    if not sheet_only:
-        tiles = turn.tiles_around(lattice_of(description).shape()[1])
-        shows[GIF_NAME] = (
-            f"a ball with {tiles} tiles around its equator on a plate; {turn.frames} frames, "
-            f"{turn.spp} paths per pixel"
-        )
-    # The exposure in use, by picture; the turntable has that of the sheet.
-    found = {name: folder.finished(name, of=asked) for name in shows}
-    kept = {name: facts is not None for name, facts in found.items()}
-    exposure = (found[SHEET_NAME] or {}).get("exposure", 0.0)
-    if not all(kept.values()):
-        exposure = _draw_missing(config, folder, kept, exposure, console)
-    made = [{"file": path / name, "shows": text, "kept": kept[name]} for name, text in shows.items()]
-    lines = [f"{p['file']}: {p['shows']}{' (kept)' if p['kept'] else ''}" for p in made]
-    lines.append(describe_exposure(exposure))
-    console.report({"folder": path, "pictures": made, "exposure": exposure}, "\n".join(lines))
+    facts = folder.finished(SHEET_NAME, of=config.exposure)
+    kept, file = facts is not None, path / SHEET_NAME
+    if facts is None:
+        load_mitsuba()
+        from mbtf_fit.backends.mitsuba import load_scene
 
-
-def _draw_missing(
-    config: MaterialPreviewConfig,
-    folder: OutputFolder,
-    kept: dict[str, bool],
-    exposure: float,
-    console: Console,
-) -> float:
-    """Draw pictures that are not kept; returns their exposure."""
-    load_mitsuba()
-    from mbtf_fit.backends.mitsuba import load_scene
-    from mbtf_fit.preview.turntable import frames, write_gif
-
-    bsdf = load_scene({"type": "mbtf", "material": config.material})
-    turns = not kept.get(GIF_NAME, True)
-    with console.progress(1 + turns * config.turntable.frames, label="drawing", unit="pictures") as bar:
-        if not kept[SHEET_NAME]:
-            values = panels(bsdf.evaluator, config.sheet)
-            exposure = chosen_exposure(
-                config.exposure, map(brightness, values.reshape(-1, *values.shape[-3:]))
-            )
-            write_png(folder.path / SHEET_NAME, contact_sheet(values, config.sheet, exposure))
+        with console.progress(1, label="drawing", unit="pictures") as bar:
+            evaluator = load_scene({"type": "mbtf", "material": config.material}).evaluator
+            values = panels(evaluator, sheet)
+            pictures = values.reshape(-1, *values.shape[-3:])
+            exposure = chosen_exposure(config.exposure, map(brightness, pictures))
+            write_png(file, contact_sheet(values, sheet, exposure))
             facts = {"exposure": exposure, "of": config.exposure}
-            folder.keep(SHEET_NAME, [folder.path / SHEET_NAME], facts)
-        bar.advance(1, "turntable; --sheet-only leaves it out" if turns else None)
-        if turns:
-            pictures = []
-            for picture in frames(bsdf, config.turntable):
-                pictures.append(to_display(picture, exposure))
-                bar.advance(1)
-            write_gif(folder.path / GIF_NAME, pictures)
-            facts = {"exposure": exposure, "of": config.exposure}
-            folder.keep(GIF_NAME, [folder.path / GIF_NAME], facts)
-    return exposure
+            folder.keep(SHEET_NAME, [file], facts)
+            bar.advance(1)
+    shows = "{} views x {} lights (columns) x {} zooms (rows)".format(*counts)
+    made = {"file": file, "shows": shows, "kept": kept, "exposure": facts["exposure"]}
+    lines = [f"{file}: {shows}{' (kept)' if kept else ''}", describe_exposure(facts["exposure"])]
+    console.report(made, "\n".join(lines))

@@ -1,11 +1,10 @@
-"""Forecast of a fit: time, size and error, from a part of its training with the same data."""
+"""Forecast of a fit: time and size, from some seconds of its training with the same data."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -19,11 +18,9 @@ from mbtf_fit.data.loader import load_training
 from mbtf_fit.models.registry import material_of
 from mbtf_fit.sections import TimeBudget
 from mbtf_fit.surface.known import surface_bytes
-from mbtf_fit.training.error_forecast import ErrorForecast, forecast_error
-from mbtf_fit.training.loop import TrainingLoop, choose_device, keep_freed_memory, restore, snapshot
+from mbtf_fit.training.loop import TrainingLoop, choose_device, keep_freed_memory
 from mbtf_fit.training.suitable_data import open_data
-from mbtf_fit.training.trainer import TrainingProgress, prepare_trainer
-from mbtf_fit.training.validation import validation_set, validation_subset
+from mbtf_fit.training.trainer import prepare_trainer
 
 # Seconds of the pilot, and of each of its pieces, whose rates give the error.
 _PILOT_SECONDS, _PIECE_SECONDS = 5.0, 1.0
@@ -55,7 +52,7 @@ def fit_bytes(config: FitConfig, lattice: Lattice) -> int:
 @dataclass(frozen=True)
 class FitForecast:
     """Expected cost of a fit: seconds of training and their standard error, of loading before and of closing
-    after it, training steps and queries per second, bytes of the material's numbers, and the error."""
+    after it, training steps and queries per second, and bytes of the material's numbers."""
 
     seconds: float
     seconds_se: float
@@ -64,12 +61,6 @@ class FitForecast:
     steps: int
     queries_per_second: float
     bytes: int
-    error: ErrorForecast
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain data for JSON."""
-        numbers = {f.name: getattr(self, f.name) for f in fields(self)}
-        return {**numbers, "error": self.error.as_dict()}
 
     def describe(self) -> str:
         """Lines."""
@@ -78,15 +69,12 @@ class FitForecast:
         beside = f"{self.loading:.0f} s of reading before, {closing}"
         return (
             f"forecast: {clock(self.seconds)}{error} of training, {self.steps} steps at "
-            f"{self.queries_per_second / 1e6:.2f} M queries/s; {beside}; {self.bytes / 1e6:.2f} MB\n"
-            f"{self.error.describe()}"
+            f"{self.queries_per_second / 1e6:.2f} M queries/s; {beside}; {self.bytes / 1e6:.2f} MB"
         )
 
 
 def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForecast:
-    """Forecast the fit of a configuration; nothing is written.
-
-    Takes a tenth to a half of the fit's steps, see :mod:`~mbtf_fit.training.error_forecast`.
+    """Forecast the fit of a configuration by a few seconds of its training; nothing is written.
 
     Raises
     ------
@@ -101,7 +89,6 @@ def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForec
     trainer = prepare_trainer(config.model_copy(update=pilot), data, partition, device)
     loading = time.perf_counter() - began
     loop = TrainingLoop([trainer])
-    start = snapshot(loop)
     # In the middle of the annealing, whose steps take as long as the average.
     loop.progress.seconds = 0.5 * config.training.blur.fraction * _ENDLESS
 
@@ -116,9 +103,6 @@ def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForec
     if asked is None and total.value < budget.seconds:
         total = Estimate(budget.seconds, 0.0, 1)
     steps = round(total.value / step.value) if asked is None else asked
-    restore(loop, start, TrainingProgress())
-    trainer.config = config
-    subset = validation_subset(trainer.model.positions, validation_set(data, partition)[1])
     return FitForecast(
         seconds=total.value,
         seconds_se=total.error,
@@ -127,5 +111,4 @@ def forecast_fit(config: FitConfig, shards: str | Path | DataFolder) -> FitForec
         steps=steps,
         queries_per_second=trainer.batch / step.value,
         bytes=sum(tensor.nbytes for tensor in trainer.model.weights().values()),
-        error=forecast_error(loop, subset, step, steps),
     )

@@ -219,11 +219,6 @@ def state_tensors(loop: TrainingLoop) -> dict[str, Tensor]:
     return tensors
 
 
-def snapshot(loop: TrainingLoop) -> dict[str, Tensor]:
-    """Copies of the loop's state, which :func:`restore` takes."""
-    return {name: tensor.detach().clone() for name, tensor in state_tensors(loop).items()}
-
-
 def weights_of(loop: TrainingLoop) -> dict[str, Tensor]:
     """Copies of the loop's state without that of its optimizers, which :func:`load_weights` takes."""
     tensors = state_tensors(loop).items()
@@ -237,18 +232,6 @@ def load_weights(loop: TrainingLoop, tensors: dict[str, Tensor], progress: Train
         _load(trainer, _own_parameters(loop, k), mine)
     loop.trainers[0].progress = progress
     loop.link()
-
-
-def restore(loop: TrainingLoop, tensors: dict[str, Tensor], progress: TrainingProgress) -> None:
-    """Set the loop's state to that of a snapshot or a checkpoint, and its progress."""
-    for k, trainer in enumerate(loop.trainers):
-        for name, p in _own_parameters(loop, k).items():
-            trainer.optimizer.state[p] = {
-                key: tensors[stored].to(p.device, copy=True)
-                for key in _MOMENTS
-                if (stored := f"{k}.adam.{key}.{name}") in tensors
-            }
-    load_weights(loop, tensors, progress)
 
 
 def write_checkpoint(loop: TrainingLoop, path: Path) -> None:
@@ -270,7 +253,14 @@ def read_checkpoint(loop: TrainingLoop, path: Path) -> None:
     """
     try:
         tensors, found = read_tensors(path)
-        restore(loop, tensors, _progress(found))
+        for k, trainer in enumerate(loop.trainers):
+            for name, p in _own_parameters(loop, k).items():
+                trainer.optimizer.state[p] = {
+                    key: tensors[stored].to(p.device, copy=True)
+                    for key in _MOMENTS
+                    if (stored := f"{k}.adam.{key}.{name}") in tensors
+                }
+        load_weights(loop, tensors, _progress(found))
         if (best := found.get("best")) is not None:
             weights = {n.removeprefix("best."): t for n, t in tensors.items() if n.startswith("best.")}
             predictions = [tensors[f"predictions.{k}"].numpy() for k in range(len(loop.trainers))]

@@ -175,7 +175,9 @@ class Trainer:
             model.textures()[0].make_residual()
         self.noise = noise
         self.loss = Objective(config.training, noise)
-        self.regularization = self.regularization_of(len(queries))
+        # Texels of `svbrdf` are its parameters: decay would move them towards an arbitrary material.
+        count = len(model.textures()[0].texels) if model.networks() else 0
+        self.regularization = Regularization.of(config.training, noise.ratio, len(queries), count)
         found, groups = kernel(), [texels, weights]
         self.optimizer: Adam | torch.optim.Adam
         self._stepper: NativeStepper | None = None
@@ -184,12 +186,6 @@ class Trainer:
             self._stepper = NativeStepper(found, model, self.optimizer)
         else:
             self.optimizer = torch.optim.Adam([{"params": g} for g in groups], betas=BETAS, fused=True)
-
-    def regularization_of(self, queries: int) -> Regularization:
-        """For so many queries of the data's noise. Texels of `svbrdf` are its parameters: decay would move
-        them towards an arbitrary material."""
-        texels = len(self.model.textures()[0].texels) if self.model.networks() else 0
-        return Regularization.of(self.config.training, self.noise.ratio, queries, texels)
 
     @property
     def backend(self) -> str:

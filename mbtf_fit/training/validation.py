@@ -42,10 +42,10 @@ def validation_set(data: Dataset, partition: Partition) -> tuple[str, ShardQueri
     return "held_out_queries", held_out
 
 
-def validation_subset(positions: int, queries: ShardQueries, most: int = _SUBSET) -> ShardQueries:
-    """At most `most` queries, evenly spread over the set; fewer for a model that reads its textures at many
+def validation_subset(positions: int, queries: ShardQueries) -> ShardQueries:
+    """At most 16384 queries, evenly spread over the set; fewer for a model that reads its textures at many
     positions per query. A copy, so that the set itself can be released."""
-    most = max(most // positions, most // 16)
+    most = max(_SUBSET // positions, _SUBSET // 16)
     return queries.take(np.arange(0, len(queries), max(1, math.ceil(len(queries) / most))))
 
 

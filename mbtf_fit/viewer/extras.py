@@ -15,10 +15,11 @@ from mbtf_core.color import ALBEDO_EXPOSURE, to_display
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import InputError
 from mbtf_core.images.environment import read_environment
-from mbtf_core.images.resample import resample
-from mbtf_core.meshes.content import joined
+from mbtf_core.images.resample import shrink
+from mbtf_core.meshes.content import joined, triangle_areas
 from mbtf_core.meshes.read import read_mesh_content
 from mbtf_core.pictures import Camera, read_references
+from mbtf_core.units import tiles_text
 from mbtf_fit.material.material import Material
 from mbtf_fit.viewer.page import encode
 from mbtf_fit.viewer.textures import pack
@@ -61,9 +62,7 @@ def picture_content(
     camera : that of the picture
     light : direction (3,) towards the light
     """
-    rows, columns = value.shape[:2]
-    shrink = max(1, -(-max(rows, columns) // _PICTURE_SIZE))
-    small = resample(value, rows // shrink, columns // shrink) if shrink > 1 else value
+    small = shrink(value, -(-max(value.shape[:2]) // _PICTURE_SIZE))
     return {
         "name": name,
         "camera": {
@@ -98,11 +97,6 @@ def poster(material: Material) -> str:
     stream = io.BytesIO()
     Image.fromarray(to_display(value, ALBEDO_EXPOSURE)).save(stream, "jpeg", quality=85)
     return f"data:image/jpeg;base64,{base64.b64encode(stream.getvalue()).decode()}"
-
-
-def tiles_text(count: float) -> str:
-    """A number of tiles in words."""
-    return "1 tile" if count == 1 else f"{count:g} tiles"
 
 
 def read_shape(path: Path) -> tuple[dict[str, F64], NDArray[np.int64], float]:
@@ -155,7 +149,7 @@ def read_shape(path: Path) -> tuple[dict[str, F64], NDArray[np.int64], float]:
     # Files have y up.
     vertices = (vertices - center)[:, [0, 2, 1]] * (1, -1, 1) / (radius or 1.0)
     normals = _unit(normals[:, [0, 2, 1]] * (1, -1, 1))
-    area, textured = _areas(vertices, uv, faces)
+    area, textured = (abs(triangle_areas(x, faces)).sum() for x in (vertices, uv))
     if textured <= 0:
         raise InputError("has texture coordinates without an area", where=path, hint="unwrap the mesh first")
     unit = float(np.sqrt(textured / area)) if area > 0 else 1.0
@@ -171,14 +165,6 @@ def read_shape(path: Path) -> tuple[dict[str, F64], NDArray[np.int64], float]:
 def _unit(vectors: F64, otherwise: ArrayLike = (0.0, 0.0, 1.0)) -> F64:
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.where(length > 0, vectors / np.where(length > 0, length, 1.0), otherwise)
-
-
-def _areas(vertices: F64, uv: F64, faces: NDArray[np.int64]) -> tuple[float, float]:
-    """Area of all triangles in space, and in the texture."""
-    a, b = (vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2))
-    s, t = (uv[faces[:, k]] - uv[faces[:, 0]] for k in (1, 2))
-    flat = np.abs(s[:, 0] * t[:, 1] - s[:, 1] * t[:, 0])
-    return float(np.linalg.norm(np.cross(a, b), axis=1).sum() / 2), float(flat.sum() / 2)
 
 
 def tangents(vertices: F64, normals: F64, uv: F64, faces: NDArray[np.int64], same: NDArray[np.int64]) -> F64:

@@ -48,6 +48,7 @@ def inspect(
     resolved = resolve_config(options, material)
     _check_new(write, overwrite)
     from mbtf_gen.tile.choices import write_material_file
+    from mbtf_gen.tile.inspection import inspection_text
     from mbtf_gen.tile.loading import load_material
 
     geometry, finest = resolved.geometry, resolved.queries.finest
@@ -70,7 +71,7 @@ def inspect(
         load_surface(loaded.surface(()))
     described = loaded.inspect(geometry, finest)
     found = {"material": resolved.material, **described, **outputs}
-    console.report(found, loaded.describe(found, resolved.material))
+    console.report(found, inspection_text(found, resolved.material))
 
 
 def _check_new(path: Path | None, overwrite: bool) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
-from mbtf_core.meshes.content import F64, I64, MeshShape, joined
+from mbtf_core.meshes.content import F64, I64, MeshShape, joined, triangle_areas
 from mbtf_core.meshes.read import read_mesh_content
 from mbtf_gen.pictures.shapes import check_cells, mitsuba_mesh
 from mbtf_gen.tile.heights import HeightGrid
@@ -76,8 +76,8 @@ class DisplacedMesh:
         tile = tiles * (uv - (0.0, 1.0)) + (0.0, aspect)
         if (up or content.up) == "y":
             vertices = vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
-        faces = faces[_areas(vertices, faces) > 0]
-        area, placed = _areas(vertices, faces), abs(_areas(tile, faces))
+        faces = faces[triangle_areas(vertices, faces) > 0]
+        area, placed = triangle_areas(vertices, faces), abs(triangle_areas(tile, faces))
         if not len(faces) or not placed.min() > 0:
             what = f"{np.sum(placed == 0):,} of {len(faces):,} triangles have no area in texture coordinates"
             raise InputError(what, where=path, hint="unwrap the mesh")
@@ -105,7 +105,7 @@ class DisplacedMesh:
         if grid is None:
             return mitsuba_mesh("shape", bsdf, self.position, self._uv(self.tile), self.faces, self.normal)
         cells = self._texels(grid)
-        count = int(np.abs(_areas(cells, self.faces)).sum()) + len(self.faces)
+        count = int(np.abs(triangle_areas(cells, self.faces)).sum()) + len(self.faces)
         check_cells("mesh", count, grid.z.shape[1])
         parts = np.concatenate([self._displaced(grid, cells, *p) for p in _pieces(cells, self.faces)])
         position, uv = parts[..., :3].reshape(-1, 3), parts[..., 3:].reshape(-1, 2)
@@ -143,14 +143,6 @@ def _check(shape: MeshShape, path: Path) -> None:
         raise InputError(f"'{shape.name}' has no texture coordinates", where=path, hint="unwrap the mesh")
     if not all(np.isfinite(x[shape.faces]).all() for x in (shape.vertices, shape.uv)):
         raise InputError(f"'{shape.name}' has vertices that are not finite", where=path)
-
-
-def _areas(points: F64, faces: I64) -> F64:
-    """Areas of triangles in space, or signed ones in the plane."""
-    a, b = (points[faces[:, k]] - points[faces[:, 0]] for k in (1, 2))
-    if points.shape[1] == 2:
-        return 0.5 * (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-    return 0.5 * np.linalg.norm(np.cross(a, b), axis=1)
 
 
 def _pieces(places: F64, faces: I64) -> Iterator[tuple[I64, F64]]:

@@ -22,9 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.data.schema import ARRAY
+from mbtf_core.data.shard_files import write_exr
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.images.exr import write_channels
 from mbtf_core.pictures import PIXEL_SIGMA, Camera
 from mbtf_gen.config.pictures import Shape
 from mbtf_gen.job import Job
@@ -223,15 +222,9 @@ class ShapeImage:
 
     def write(self, path: Path) -> Path:
         """Write ``path`` + ``.exr``, atomically, and return its path."""
-        rows, columns = self.transmittance.shape
-        arrays = {**vars(self), "spp": np.full((rows, columns), self.spp, np.float32)}
-        channels = {
-            channel: np.ascontiguousarray(np.atleast_3d(array)[..., index])
-            for name, array in arrays.items()
-            for index, channel in enumerate(ARRAY[name].channels)
-        }
+        arrays = {**vars(self), "spp": np.full(self.transmittance.shape, self.spp, np.float32)}
         exr = path.with_name(f"{path.name}.exr")
-        write_channels(exr, channels, {"mbtf.lead": f"1,{rows},{columns}"})
+        write_exr(exr, {name: array[None] for name, array in arrays.items()}, complete=False)
         return exr
 
 

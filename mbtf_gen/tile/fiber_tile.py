@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mbtf_gen.config.generator import GeometrySection
 from mbtf_gen.tile.fibers.curves import F64, Bundle, Curve
 from mbtf_gen.tile.fibers.draft import Weave
-from mbtf_gen.tile.protocol import REFLECTION, Tile, brief_warnings
+from mbtf_gen.tile.protocol import REFLECTION, Tile
 from mbtf_gen.tile.tracers.protocol import TileGeometry
 
 # Coefficients of σ_a from the color of many fibers, of a polynomial in the azimuthal roughness: Chiang et al.
@@ -221,27 +221,6 @@ class FiberTile(Tile):
                 zip(self.names, self.colors, self.scattering, strict=True)
             )
         }
-
-    def describe(self, found: Mapping[str, Any], name: str) -> str:
-        f = found["fibers"]
-        low, high = f["radius"]
-        radius = f"{low:.3g}" if low == high else f"{low:.3g} .. {high:.3g}"
-        lines = [
-            f"{name}: tile 1 x {found['aspect']:.4g}, fibers, resolution {found['resolution']}",
-            "",
-            f"fibers      {f['count']:,} with {f['segments']:,} segments, radius {radius}, total length "
-            f"{f['length']:,.5g} tile widths",
-            f"cloth       {f['thickness']:.3g} tile widths thick, {f['share_of_volume']:.0%} of it fibers",
-        ]
-        for key, yarn in found["yarns"].items():
-            color = " ".join(f"{c:.2f}" for c in yarn["color"])
-            lines.append(
-                f"{key[:11]:<11} color {color}, {yarn['fibers']:,} fibers, roughness {yarn['roughness']:g} "
-                f"along and {yarn['azimuthal_roughness']:g} around the fiber, scale tilt "
-                f"{yarn['scale_tilt']:g}°, ior {yarn['ior']:g}"
-            )
-        lines += [f"warning     {text}" for text in brief_warnings(found["warnings"])]
-        return "\n".join(lines if self.weave is None else [*lines, *self.weave.describe()])
 
 
 def absorption(color: F64, azimuthal_roughness: float) -> F64:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal, Self
@@ -22,7 +22,7 @@ from mbtf_gen.tile.heights import (
     rms_slope,
     slope_angles,
 )
-from mbtf_gen.tile.inspection import ALBEDO_RANGE, inspection_text, oddities
+from mbtf_gen.tile.inspection import ALBEDO_RANGE, oddities
 from mbtf_gen.tile.maps.checks import Codes, far_off, suggestion_warning
 from mbtf_gen.tile.maps.file_names import Convention
 from mbtf_gen.tile.maps.map_loader import Color, MapFacts
@@ -160,11 +160,6 @@ class HeightFieldTile(Tile):
             return what, f"save them as floats: as integers they need {scale:.4g}, more than {MAX_SCALE}"
         apart = f"its pixels are {facts.pixel_size:.6g} apart"
         return what, f"give --height-scale {scale:.4g}, as {apart}, where heights have the same unit"
-
-    def coarser_grid(self, most: int) -> HeightGrid:
-        if max(self.grid.z.shape) <= most:
-            return self.grid
-        return self.at(mesh=max(1, min(most, int(most / self.aspect)))).grid
 
     @property
     def thickness(self) -> float:
@@ -329,9 +324,6 @@ class HeightFieldTile(Tile):
             "holes": float(np.mean(opacity < 0.5)),
             "partly": float(np.mean((opacity > 0.02) & (opacity < 0.98))),
         }
-
-    def describe(self, found: Mapping[str, Any], name: str) -> str:
-        return inspection_text(found, name)
 
     def summary(self) -> str:
         """Mesh, height scale and displacement range."""

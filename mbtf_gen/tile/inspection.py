@@ -1,17 +1,11 @@
-"""The statistics of a height field, which :meth:`HeightFieldTile.inspect` collects, as text for people."""
+"""The statistics of a tile, which :meth:`Tile.inspect` collects, as text; unusual properties of heights."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-
-from mbtf_gen.tile.maps.checks import CONVENTION_NAMES, far_off, signed
-from mbtf_gen.tile.maps.material_file import ROLES, layers_above
-from mbtf_gen.tile.protocol import brief_warnings
 
 # Luminance from charcoal to fresh snow; outside, a color map is probably not albedo.
 ALBEDO_RANGE = (0.02, 0.95)
@@ -19,12 +13,10 @@ ALBEDO_RANGE = (0.02, 0.95)
 _KEPT = 0.9
 # Texels above which few distinct floats indicate quantization.
 _MANY = 4096
-# Width to which long texts are wrapped.
-_WIDTH = 100
-
-# What each map does to the simulation.
-USES = {"height": "displaces the mesh", **{name: role.use for name, role in ROLES.items()}}
-_KINDS = {1: "gray", 2: "gray+alpha", 3: "RGB", 4: "RGBA"}
+# Width to which long texts are wrapped, and lines of the longest list.
+_WIDTH, _MOST_LINES = 100, 24
+# Sentences among the statistics, and what repeats them.
+_TEXTS = ("material", "notes", "oddities", "warnings", "scale_warning", "unused")
 
 
 def oddities(found: Mapping[str, Any]) -> list[str]:
@@ -50,131 +42,64 @@ def oddities(found: Mapping[str, Any]) -> list[str]:
 
 
 def inspection_text(found: Mapping[str, Any], name: str) -> str:
-    """The data of :func:`inspect` as text for people."""
-    surface = found["surface"] + layers_above({*found["maps"], *found["constants"]})
-    lines = [
-        f"{name}: tile 1 x {found['aspect']:g}, surface {surface}, make-tileable {found['make_tileable']}, "
-        f"resolution {found['resolution']}",
-        "",
-        *_maps(found),
-        *_unused(found),
-        "",
-        *_geometry(found),
-        *_color(found),
-        *_normals(found),
-    ]
-    if written := found.get("written"):
-        stored = (f"{name} {c['value']} ({c['reason']})" for name, c in written["choices"].items())
-        lines += ["", *_wrapped("written    ", f"{written['file']}: {', '.join(stored)}")]
+    """Statistics of a tile as text: name, value and unit of each, then remarks and warnings."""
+    numbers = {key: value for key, value in found.items() if key not in _TEXTS}
+    flat = {key: value for key, value in numbers.items() if not _is_nested(value)}
+    lines = [f"{name} (lengths in tile widths)"]
+    for key, value in {"tile": flat, **{k: v for k, v in numbers.items() if k not in flat}}.items():
+        lines += _lines(key, value)
     # The most important one comes last.
-    scale, others = found["scale_warning"], [w for w in found["warnings"] if w != found["scale_warning"]]
-    for title, texts in (("warnings", brief_warnings(others)), ("remarks", found["oddities"])):
-        lines += ["", title] if texts else []
+    scale = found.get("scale_warning")
+    warnings = brief_warnings(w for w in found["warnings"] if w != scale)
+    for title, texts in (
+        ("note", found["notes"]),
+        ("remark", found.get("oddities", ())),
+        ("warning", [*warnings, *(brief_warnings([scale]) if scale else ())]),
+    ):
         for text in texts:
-            lines += _wrapped("  - ", text)
-    lines += ["", f"warning: {brief_warnings([scale])[0]}"] if scale is not None else []
+            lines += _wrapped(f"{title}: ", text)
     return "\n".join(lines)
+
+
+def brief_warnings(warnings: Iterable[str]) -> list[str]:
+    """Warnings without the folders of their files."""
+    parts = (text.partition(": ") for text in warnings)
+    return [f"{Path(path).name}: {rest}" for path, _, rest in parts]
+
+
+def _is_nested(value: Any) -> bool:
+    """Whether a value takes lines of its own."""
+    if isinstance(value, list | tuple):
+        return any(isinstance(item, Mapping | list | str) for item in value)
+    return isinstance(value, Mapping)
+
+
+def _lines(name: str, value: Any) -> Iterator[str]:
+    """A section's numbers in a line, and its sections below it."""
+    if isinstance(value, Mapping):
+        known = {key: item for key, item in value.items() if item is not None and item != ()}
+        flat = [f"{key} {_shown(item)}" for key, item in known.items() if not _is_nested(item)]
+        if flat:
+            yield from _wrapped(f"{name:<14} ", ", ".join(flat))
+        for key, item in known.items():
+            if _is_nested(item):
+                yield from _lines(f"{name}.{key}", item)
+    elif len(value) > _MOST_LINES:
+        yield f"{name:<14} {len(value)} items; --json prints them"
+    else:
+        for number, item in enumerate(value, 1):
+            if _is_nested(item):
+                yield from _lines(f"{name}.{number}", item)
+            else:
+                yield f"{name:<14} {item}"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, list | tuple):
+        return " ".join(map(_shown, value))
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _wrapped(head: str, text: str) -> list[str]:
     """Lines of a text behind its head, all of them indented by the width of the head."""
     return textwrap.wrap(text, _WIDTH, initial_indent=head, subsequent_indent=" " * len(head))
-
-
-def _maps(found: Mapping[str, Any]) -> list[str]:
-    rows = [["map", "file", "size", "kind", "use"]]
-    for role, facts in found["maps"].items():
-        if role.startswith("bsdf"):
-            continue
-        name = Path(facts["file"]).name + (f"[{','.join(facts['names'])}]" if facts["names"] else "")
-        depth = "float" if facts["bits"] is None else f"{facts['bits']}-bit"
-        space = facts["colorspace"]
-        decoded = {"srgb": ", sRGB decoded", "linear": ""}.get(space, f", converted from {space}")
-        decoded += ", inverted" if facts["inverted"] else ""
-        linear = ", linear" if role == "base_color" and not decoded else ""
-        size, kind = f"{facts['columns']}x{facts['rows']}", f"{depth} {_KINDS[facts['channels']]}"
-        rows.append([role, name, size, kind, USES[role] + decoded + linear])
-    for role, value in found["constants"].items():
-        if role not in found["maps"]:
-            numbers = np.atleast_1d(value)
-            gray = numbers[:1] if np.ptp(numbers) == 0 else numbers
-            shown = ", ".join(f"{number:.3g}" for number in gray)
-            rows.append([role, f"constant {shown}", "", "", USES[role]])
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    padded = (map(str.ljust, row, widths) for row in rows)
-    return [" ".join(cells).rstrip() for cells in padded]
-
-
-def _unused(found: Mapping[str, Any]) -> list[str]:
-    """Images of the folder that are not used, those of one reason together."""
-    reasons: dict[str, list[str]] = {}
-    for name, why in found["unused"].items():
-        reasons.setdefault(why, []).append(name)
-    out = []
-    for why, names in reasons.items():
-        text = f"{', '.join(names)}: {why}"
-        out += _wrapped("not used   ", text)
-    return out
-
-
-def _geometry(found: Mapping[str, Any]) -> list[str]:
-    g, h, file = found["geometry"], found["heights"], found["maps"]["height"]
-    out = [
-        f"height     scale {g['height_scale']:.4g} ({g['height_scale_from']}), stored {file['low']:.4g} .. "
-        f"{file['high']:.4g}, displacement range {g['displacement_range']:.4g} tile widths",
-        f"mesh       {g['mesh'][1]} x {g['mesh'][0]} of {g['map'][1]} x {g['map'][0]} texels, keeps "
-        f"{g['slope_kept']:.0%} of the map's RMS slope",
-        f"slopes     median {g['slope_median_deg']:.1f}°, 99th percentile {g['slope_p99_deg']:.1f}°, "
-        f"steepest {g['slope_max_deg']:.1f}°",
-    ]
-    if (codes := h["codes"]) is not None:
-        apart = f", {codes['spacing']:.4g} codes apart" if codes["spacing"] > 1 else ""
-        out.append(f"values     {codes['levels']} distinct, codes {codes['low']} .. {codes['high']}{apart}")
-    if found["tiling"]:
-        axes = ", ".join(f"along {t['axis']} {'yes' if t['tiles'] else 'NO'}" for t in found["tiling"])
-        steps = " and ".join(f"{t['ratio']:.2g}" for t in found["tiling"])
-        out.append(f"tiling     {axes}; steps across the border are {steps} times the 99th percentile inside")
-        if found["make_tileable"] != "none":
-            out.append(f"           before make-tileable {found['make_tileable']}, which closes the seams")
-    return out
-
-
-def _color(found: Mapping[str, Any]) -> list[str]:
-    out = []
-    if (a := found["albedo"]) is not None:
-        mean = " ".join(f"{c:.2f}" for c in a["mean_rgb"])
-        luminance = f"{a['min']:.3f} .. {a['max']:.3f}, median {a['median']:.3f}"
-        out.append(f"albedo     mean {mean}, luminance {luminance}")
-    if (o := found["opacity"]) is not None:
-        out.append(f"opacity    holes {o['holes']:.1%} of the tile, partly transparent {o['partly']:.1%}")
-    return out
-
-
-def _normals(found: Mapping[str, Any]) -> list[str]:
-    n = found["normal"]
-    if n is None:
-        return []
-    tilt = (
-        f"normals    {CONVENTION_NAMES[n['convention']]}, tilt median {n['tilt_median_deg']:.1f}°, "
-        f"99th percentile {n['tilt_p99_deg']:.1f}°"
-    )
-    if "best" not in n:
-        return [f"{tilt}; nothing to compare with the heights"]
-    out = [
-        tilt,
-        f"           correlation with the heights' slopes: u {signed(n['correlation_u'])}, "
-        f"v {signed(n['correlation_v'])}; OpenGL {n['gl']:.2f}, DirectX {n['dx']:.2f}",
-    ]
-    if n["misfit"]:
-        how = f"the {n['image']} map {n['turn']}" if n["turn"] else "heights upside down"
-        out.append(f"           DOES NOT FIT; fits with {how}: correlation {n['best']:.2f}")
-    elif (scale := n["suggested_height_scale"]) is not None:
-        # A warning names a scale that is far off.
-        if not far_off(found["geometry"]["height_scale"], scale):
-            out.append(
-                f"           slopes agree best at --height-scale {scale:.3g}; "
-                f"{found['geometry']['height_scale']:.3g} is in use"
-            )
-    else:
-        out.append("           at no height scale do the slopes agree: the normal map shows other details")
-    return out

@@ -13,13 +13,11 @@ from numpy.typing import NDArray
 from mbtf_core.meshes.content import Value, numbers_of
 from mbtf_gen.config.generator import GeometrySection
 from mbtf_gen.tile.maps.material_file import LOBES, REFLECTING, ROLES
-from mbtf_gen.tile.protocol import REFLECTION, Tile, brief_warnings, layer_weight
+from mbtf_gen.tile.protocol import REFLECTION, Tile, layer_weight
 from mbtf_gen.tile.reflectance import in_use, lobe_widths, plugin_dictionary
 from mbtf_gen.tile.tracers.protocol import TileGeometry
 
 F64 = NDArray[np.float64]
-# Weights of a part that are described, in words of their roles.
-_TOLD = ("metallic", "clearcoat", "sheen", "opacity")
 # Distance in tile widths within which vertices count as one.
 _SAME = 1e-5
 # Side of the cells that hold one vertex each in this comparison.
@@ -181,24 +179,6 @@ class MeshTile(Tile):
             "warnings": list(self.warnings),
             "notes": list(self.notes),
         }
-
-    def describe(self, found: Mapping[str, Any], name: str) -> str:
-        edges, thick = found["open_edges"], f"{found['thickness']:.3g}"
-        closed = f"{edges} open edge{'s' * (edges != 1)}" if edges else "closed: every edge has two triangles"
-        lines = [
-            f"{name}: tile 1 x {found['aspect']:.4g}, triangles, resolution {found['resolution']}",
-            "",
-            f"mesh     {found['triangles']:,} triangles, {thick} tile width{'s' * (thick != '1')} thick; "
-            f"{closed}",
-        ]
-        for part in found["parts"]:
-            color = " ".join(f"{c:.2g}" for c in part["base_color"])
-            gloss = f"mean roughness {part['roughness']:.2f}" if "roughness" in part else "Lambert"
-            rest = "".join(f", {name} {part[name]:.2g}" for name in _TOLD if part.get(name))
-            lines.append(
-                f"part     {part['name']}: {part['triangles']:,} triangles, mean color {color}, {gloss}{rest}"
-            )
-        return "\n".join([*lines, *(f"warning  {text}" for text in brief_warnings(found["warnings"]))])
 
 
 def _mean(value: Value) -> float | list[float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -84,10 +84,6 @@ class Tile(ABC):
     def at(self, height_scale: float | None = None, mesh: int | None = None) -> Self:
         """The tile at another height scale and resolution of the mesh, where it has them."""
         return self
-
-    def coarser_grid(self, most: int) -> HeightGrid | None:
-        """:attr:`grid`, or a coarser one of at most so many cells along each side."""
-        return None
 
     @abstractmethod
     def trace(self, unit: float, below: bool = False) -> TileGeometry:
@@ -204,10 +200,6 @@ class Tile(ABC):
     def inspect(self, options: GeometrySection, finest: int | None = None) -> dict[str, Any]:
         """Statistics as plain data, ``warnings`` and ``notes`` among them, for levels up to `finest`."""
 
-    @abstractmethod
-    def describe(self, found: Mapping[str, Any], name: str) -> str:
-        """The data of :meth:`inspect` as text for people."""
-
     def summary(self) -> str | None:
         """The options in use, in a line; None where there are none."""
         return None
@@ -219,12 +211,6 @@ class Tile(ABC):
     def warnings_in_use(self) -> tuple[str, ...]:
         """Warnings, those that depend on the options included."""
         return self.warnings
-
-
-def brief_warnings(warnings: Iterable[str]) -> list[str]:
-    """Warnings without the folders of their files."""
-    parts = (text.partition(": ") for text in warnings)
-    return [f"{Path(path).name}: {rest}" for path, _, rest in parts]
 
 
 def layer_weight(maps: Mapping[str, Any], effect: str) -> float:

@@ -32,7 +32,6 @@ from mbtf_gen.config.pictures import EXPOSURE
 
 if TYPE_CHECKING:
     from mbtf_pipeline.collection.run import CollectionResult
-    from mbtf_pipeline.recipe import Recipe
     from mbtf_pipeline.run import RunResult
 
 
@@ -58,8 +57,7 @@ def run(
 
     A stage whose inputs have not changed is skipped; the same command again resumes an interrupted run.
     --time is the time of everything: it takes the best preset of --quality that fits, trains for the rest,
-    and replaces the recipe's own times. --dry-run forecasts the time, and the error by pilots on data that
-    are generated already.
+    and replaces the recipe's own times. --dry-run forecasts the time.
 
     Parameters
     ----------
@@ -114,7 +112,7 @@ def run(
         folder = output or loaded.folder
         from mbtf_core.config.settings import explicit_options
         from mbtf_pipeline.recipe import is_single, preset_recipe, with_training
-        from mbtf_pipeline.run_time import TimedRun, forecast_left
+        from mbtf_pipeline.run_time import RunForecaster, TimedRun, forecast_left
 
         # The file may be another one when the run has ended.
         single = is_single(explicit_options(recipe, own)["fit"])
@@ -134,7 +132,11 @@ def run(
         if error is not None:
             loaded = with_training(loaded, error=error)
         if dry_run:
-            _forecast(loaded, folder, console)
+            forecaster = RunForecaster(loaded)
+            forecaster.job.announce_briefly()
+            forecast = forecaster.of(loaded)
+            numbers = {"seconds": forecast.seconds, "bytes": forecast.bytes}
+            console.report(numbers, forecast.describe())
             return
         keep_on_interruption(f"the finished stages are kept in {folder}")
         from mbtf_pipeline.run import run_recipe
@@ -151,26 +153,6 @@ def run(
                 runner=runner,
             )
         _report(result, console, quality, partial(_next_command, recipe, single, given))
-
-
-def _forecast(recipe: Recipe, folder: Path, console: Console) -> None:
-    """Report time and errors of a run, which are forecasts."""
-    from mbtf_pipeline.cost.forecast import forecast_errors
-    from mbtf_pipeline.run_time import RunForecaster
-
-    forecaster = RunForecaster(recipe)
-    forecaster.job.announce_briefly()
-    errors = forecast_errors(recipe, folder, console.note)
-    training = {name: found["forecast"]["seconds"] for name, found in errors.items() if found["source"]}
-    expected = forecaster.of(recipe, training=training)
-    lines = [expected.describe()]
-    by_text: dict[str, list[str]] = {}
-    for name, found in errors.items():
-        by_text.setdefault(found["text"], []).append(name)
-    for text, names in by_text.items():
-        first, *more = text.splitlines()
-        lines += [f"  {', '.join(names)}: {first}", *(f"    {m}" for m in more)]
-    console.report({"seconds": expected.seconds, "bytes": expected.bytes, "fits": errors}, "\n".join(lines))
 
 
 def _refuse(given: Mapping[str, Any], flags: Sequence[str], kind: str, hint: str) -> None:
@@ -325,11 +307,11 @@ def report(
         Folder of the run.
     """
     from mbtf_core.color import describe_exposure
-    from mbtf_pipeline.collection.run import is_collection, write_again
+    from mbtf_pipeline.collection.run import COLLECTION, write_again
     from mbtf_pipeline.run import rerender
 
     used = None
-    if is_collection(folder):
+    if COLLECTION.read(folder) is not None:
         if exposure is not None:
             raise UsageError("the page of several runs has no exposure", where="--exposure")
         path = write_again(folder)

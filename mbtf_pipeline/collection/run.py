@@ -50,11 +50,6 @@ class CollectionResult:
         return [run["name"] for run in self.runs if run["state"] == state]
 
 
-def is_collection(folder: Path) -> bool:
-    """Whether a folder contains runs of several materials; those of another schema version are refused."""
-    return COLLECTION.read(folder) is not None
-
-
 def run_collection(
     recipe: Collection,
     file: Path,
@@ -192,10 +187,8 @@ def _write(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Path]]:
 
 
 def write_again(folder: Path) -> Path:
-    """Write the page and tables of finished runs again; returns the page's path. An InputError where the
-    folder contains no runs of several materials, or none that is finished."""
-    if not is_collection(folder):
-        raise InputError("contains no library or paper", where=folder)
+    """Write the page and tables of finished runs again; returns the page's path. An InputError where none is
+    finished."""
     record = read_json(folder / COLLECTION.record)
     if all(run["state"] != "done" for run in record["runs"]):
         raise InputError("contains no finished run", where=folder, hint="run the recipe again: it resumes")

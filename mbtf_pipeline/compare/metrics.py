@@ -66,14 +66,6 @@ def image_errors(
     return {"mse": mse, "psnr": psnr(mse, peak), "relative_mse": relative}
 
 
-def reference_difference(
-    first: tuple[ArrayLike, ArrayLike], value_a: ArrayLike, value_b: ArrayLike
-) -> Estimate:
-    """Noise-free mean squared difference of two references, each given as two independent halves."""
-    a1, b1, a2, b2 = (np.asarray(x, np.float64).reshape(-1, 3) for x in (*first, value_a, value_b))
-    return mean_estimate((a1 - a2) * (b1 - b2))
-
-
 def dataset_errors(materials: Mapping[str, Material], data: Dataset) -> dict[str, Any]:
     """Errors of every fit on the test split of one data set, and on the splits held out in its own training.
 

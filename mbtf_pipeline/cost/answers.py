@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from mbtf_core.forecast import INSUFFICIENT, expected_seconds
 from mbtf_core.stats import Estimate, Interval, LearningCurve
 from mbtf_core.units import clock, format_duration
 from mbtf_pipeline.cost.measurement import Measurement
@@ -21,8 +20,8 @@ FARTHEST = 4.0
 # Total times that are forecast, in seconds, where they lie beyond the longest run by this factor.
 _TIMES = (60.0, 120.0, 300.0, 600.0, 1200.0, 3600.0, 7200.0, 18000.0, 36000.0)
 _BEYOND = 1.3
-# What limits the error of a study's runs, whose data grow with their time.
-_LIMITS = "with this network, however many queries"
+# Said where the bounds of a forecast are too far apart to plan by.
+_INSUFFICIENT = "the evidence does not suffice"
 
 
 def _work(run: Measurement) -> float:
@@ -105,7 +104,14 @@ class Evidence:
         time = Interval(found.value + least, found.low + least, found.high + least)
         if self.farthest < time.value < math.inf:
             return f"error {error:g}: takes more than {clock(self.farthest)}, where the forecast ends"
-        return expected_seconds(error, time, curve.limit, _LIMITS)
+        if time.suffices:
+            span = f"{clock(time.low)} to {clock(time.high)}"
+            return f"error {error:g}: about {clock(time.value)} ({span})"
+        if time.low == math.inf:
+            # The data of a study's runs grow with their time.
+            why = "with this network, however many queries"
+            return f"error {error:g}: not reachable {why}: they limit it at about {curve.limit}"
+        return f"error {error:g}: {_INSUFFICIENT}, but it takes at least {clock(time.low)}"
 
 
 def answers(evidence: Evidence) -> list[dict[str, Any]]:
@@ -121,7 +127,7 @@ def answers(evidence: Evidence) -> list[dict[str, Any]]:
     for seconds in evidence.times():
         found = evidence.error_after(seconds)
         assert found is not None
-        text = str(found) if found.suffices else INSUFFICIENT
+        text = str(found) if found.suffices else _INSUFFICIENT
         basis = f"forecast, {seconds / evidence.runs[-1].seconds.value:.2g} times the longest run"
         time = format_duration(seconds) if seconds in _TIMES else clock(seconds)
         number = {"seconds": seconds, "unexplained": found.as_dict(), "forecast": True}

@@ -27,7 +27,9 @@ from mbtf_core.color import (
     to_display,
     white_of,
 )
+from mbtf_core.images.resample import shrink
 from mbtf_core.stats import local_error
+from mbtf_core.units import tiles_text
 from mbtf_pipeline.compare.image_files import read_halves, read_map, read_picture
 from mbtf_pipeline.compare.offsets import read_offset, towards_view
 from mbtf_pipeline.compare.perceptual_metrics import available_metrics
@@ -41,7 +43,6 @@ from mbtf_pipeline.tables import (
     levels_text,
     short_direction,
     signed,
-    width,
 )
 
 U8 = NDArray[np.uint8]
@@ -72,17 +73,6 @@ def color_bar(
         "ticks": ticks,
         "unit": unit,
     }
-
-
-def shrink(values: Pixels, factor: int) -> Pixels:
-    """Average `factor` × `factor` pixels of (rows, columns, ...); incomplete blocks are dropped."""
-    if factor == 1:
-        return values
-    factor = min(factor, *values.shape[:2])
-    rows, columns = (n // factor for n in values.shape[:2])
-    cut = values[: rows * factor, : columns * factor]
-    out: Pixels = cut.reshape(rows, factor, columns, factor, *values.shape[2:]).mean(axis=(1, 3))
-    return out
 
 
 def data_uri(display: U8, kind: Literal["png", "jpeg"] = "png", colors: Palette | None = None) -> str:
@@ -203,13 +193,14 @@ def scaled_maps(
 
 
 def _title(comparison: Mapping[str, Any], picture: Mapping[str, Any]) -> str:
-    return f"{width(picture['tiles_across'])}, {levels_text(picture['levels'], comparison['finest'])}"
+    levels = levels_text(picture["levels"], comparison["finest"])
+    return f"{tiles_text(picture['tiles_across'])} across, {levels}"
 
 
 def _block(comparison: Mapping[str, Any], picture: Mapping[str, Any], number: int) -> dict[str, Any]:
     """Figures of one scene: references and fits, side by side; below each fit, its error maps."""
     where = f": view {direction(picture['view'])}, light {direction(picture['light'])}, "
-    where += width(picture["tiles_across"])
+    where += f"{tiles_text(picture['tiles_across'])} across"
     references, fits, kinds = [], [], comparison["kinds"]
     for kind in kinds:
         reference = picture["references"][kind]
@@ -252,7 +243,7 @@ def _scene(comparison: Mapping[str, Any], picture: Mapping[str, Any]) -> dict[st
     ]
     return {
         "where": where + _title(comparison, picture),
-        "tiles_across": width(picture["tiles_across"]),
+        "tiles_across": f"{tiles_text(picture['tiles_across'])} across",
         "references": references,
         "fits": [picture["fits"][fit]["file"] for fit in comparison["fits"]],
     }

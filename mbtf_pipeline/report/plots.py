@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.files.atomic import write_through
-from mbtf_pipeline.report.labels import place_labels
 
 # Okabe and Ito (2008) with gray instead of black and without yellow: distinguishable under every common
 # color-vision deficiency.
@@ -106,11 +105,8 @@ def plot(
         axes.grid(True, which="major", color=_INK, alpha=0.12, linewidth=0.6)
         low, high = _range(series)
         handles: list[tuple[Any, str]] = []
-        labels: list[Any] = []
         for index, one in enumerate(series):
-            entries, notes = _draw(axes, index, one, low, high)
-            handles += entries
-            labels += notes
+            handles += _draw(axes, index, one, low, high)
         if front:
             step = axes.step(*np.asarray(front, float).T, where="post", color=_INK, lw=1.3, ls=(0, (4, 2)))
             handles.append((step[0], "Pareto front"))
@@ -127,7 +123,6 @@ def plot(
         if handles:
             marks, names = zip(*handles, strict=True)
             figure.legend(marks, names, ncols=2, loc="outside upper left", frameon=False, fontsize=8.5)
-        place_labels(axes, labels)
         if png is not None:
             options = {"dpi": 160, "facecolor": "white", "metadata": {"Software": None}}
             write_through(png, lambda path: figure.savefig(path, format="png", **options))
@@ -172,18 +167,15 @@ def _bounds(one: Series) -> NDArray[np.float64]:
     return np.asarray(one.y, float) + np.stack([-lower, upper])
 
 
-def _draw(
-    axes: Any, index: int, one: Series, low: float, high: float
-) -> tuple[list[tuple[Any, str]], list[Any]]:
-    """Draw a series, its values within the limits of the axis; returns its marks and names for the legend,
-    and its labels, which are still to be placed."""
+def _draw(axes: Any, index: int, one: Series, low: float, high: float) -> list[tuple[Any, str]]:
+    """Draw a series, its values within the limits of the axis; returns its marks and names for the legend."""
     color = COLORS[index % len(COLORS)]
     x, y = np.asarray(one.x, float), np.clip(np.asarray(one.y, float), low, high)
     if one.style == "line":
         (mark,) = axes.plot(x, y, color=color, linewidth=1.7)
         if one.y_error is not None:
             axes.fill_between(x, *np.clip(_bounds(one), low, high), color=color, alpha=0.18, linewidth=0)
-        return [(mark, one.name)], []
+        return [(mark, one.name)]
     x_error, y_error = (
         None if error is None else np.minimum(np.nan_to_num(error, posinf=0.0), 0.95 * values)
         for error, values in ((one.x_error, x), (one.y_error, y))
@@ -194,17 +186,14 @@ def _draw(
     if one.style == "joined":
         axes.plot(x, y, color=color, linewidth=0.8, alpha=0.5)
     style = {"textcoords": "offset points", "fontsize": 7.5, "color": color}
-    labels = [
-        axes.annotate(text, at, (6, 5), **style) for *at, text in zip(x, y, one.labels, strict=False) if text
-    ]
-    for label in labels:
+    for *at, text in zip(x, y, one.labels, strict=False):
         # Otherwise constrained layout would shrink the axes for the label.
-        label.set_in_layout(False)
+        axes.annotate(text, at, (6, 5), **style).set_in_layout(False)
     marks = [(drawn.lines[0], one.name)]
     if one.x_error_name:
         (bar,) = axes.plot([], [], color=color, linewidth=1.1, marker="|", markersize=5)
         marks.append((bar, one.x_error_name))
-    return marks, labels
+    return marks
 
 
 def _extend(axes: Any) -> None:

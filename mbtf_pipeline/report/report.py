@@ -15,6 +15,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json
 from mbtf_core.files.editable import read_document, write_document
 from mbtf_core.pictures import Camera
+from mbtf_core.units import tiles_text
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.compare.image_files import read_picture
 from mbtf_pipeline.recipe import RECIPE_NAME, Recipe
@@ -30,7 +31,7 @@ from mbtf_pipeline.report.sections import (
 from mbtf_pipeline.stages import COMPARE, FITS, REPORT, RUN, SHARDS, VIEWER
 
 # Raised when the report or the viewer's page changes; part of the stage's key.
-LAYOUT = 19
+LAYOUT = 20
 # Path-traced pictures in the viewer's page.
 _MOST_PICTURES = 4
 
@@ -135,7 +136,7 @@ def write_viewer(folder: Path, title: str, comparison: Mapping[str, Any]) -> Non
 
 def run_pictures(folder: Path) -> list[dict[str, Any]]:
     """The first path-traced pictures of a run's comparison, for the viewer."""
-    from mbtf_fit.viewer.extras import picture_content, tiles_text
+    from mbtf_fit.viewer.extras import picture_content
 
     out = []
     for picture in read_json(folder / COMPARE / COMPARISON_NAME)["pictures"][:_MOST_PICTURES]:

@@ -12,12 +12,13 @@ import numpy as np
 
 from mbtf_core.color import linear_to_srgb
 from mbtf_core.errors import MbtfError
+from mbtf_core.images.resample import shrink
 from mbtf_core.stats import Estimate
 from mbtf_fit.formatting import SPLIT_NAMES
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.tile.inspection import USES
+from mbtf_gen.tile.inspection import brief_warnings, inspection_text
 from mbtf_gen.tile.loading import latest_material
-from mbtf_pipeline.report.images import U8, Pixels, data_uri, shrink
+from mbtf_pipeline.report.images import U8, Pixels, data_uri
 from mbtf_pipeline.report.plots import Series, plot, points
 from mbtf_pipeline.stages import FITS, read_stamp
 from mbtf_pipeline.tables import NOT_SIGNIFICANT, data_errors, estimate, is_significant
@@ -212,7 +213,7 @@ def material_section(config: GeneratorConfig, inputs: Mapping[str, str]) -> dict
     try:
         material = latest_material(config.material, geometry.make_tileable, geometry.max_pixels)
         found = material.inspect(geometry)
-        text = material.describe(found, config.material)
+        text = inspection_text(found, config.material)
     except (MbtfError, OSError) as error:
         return nothing | {"missing": f"The material cannot be read any more: {error}"}
     if material.digests != inputs:
@@ -223,14 +224,12 @@ def material_section(config: GeneratorConfig, inputs: Mapping[str, str]) -> dict
         if value is None or np.ndim(value) < 2:
             continue
         name, title = Path(facts["file"]).name, role.replace("_", " ").capitalize()
-        lines = [name, f"{facts['columns']} × {facts['rows']}, {USES[role]}"]
+        lines = [name, f"{facts['columns']} × {facts['rows']}"]
         if role == "height":
             lines.append(f"{facts['low']:.4g} (black) to {facts['high']:.4g} (white)")
         image = data_uri(_thumbnail(role, np.asarray(value)), "jpeg")
         maps.append({"label": title, "lines": lines, "image": image, "alt": f"{title}: {name}", "file": ""})
-    # Without the folders of their files.
-    parts = (warning.partition(": ") for warning in found["warnings"])
-    warnings = [f"{Path(path).name}: {text}" for path, _, text in parts] + found.get("oddities", [])
+    warnings = [*brief_warnings(found["warnings"]), *found.get("oddities", [])]
     return {"maps": maps, "warnings": warnings, "inspection": text, "missing": ""}
 
 

@@ -26,8 +26,6 @@ Draft = NDArray[np.bool_]
 _MOST_YARNS = 1024
 # Crossings of one tile, each of some hundred fiber segments.
 _MOST_CROSSINGS = 1 << 16
-# Rows and columns of a draft that are shown.
-_SHOWN = 48
 
 
 def plain() -> Draft:
@@ -222,38 +220,7 @@ class Weave:
         """Draft, sequences, and color-and-weave effect as plain data."""
         return {
             "draft": ["".join("X" if up else "." for up in row) for row in self.draft],
-            "warp": list(self.warp),
-            "weft": list(self.weft),
-            "seen": self.seen().tolist(),
+            "warp": " ".join(self.warp),
+            "weft": " ".join(self.weft),
+            "seen": [" ".join(row) for row in self.seen()],
         }
-
-    def describe(self) -> list[str]:
-        """Lines for people: the draft, and beside it the letters of the yarns above."""
-        (rows, columns), letters = self.draft.shape, self.letters()
-        seen = self.seen()
-        shown = min(rows, _SHOWN), min(columns, _SHOWN)
-        part = "" if shown == (rows, columns) else f"; the first {shown[1]} x {shown[0]} are shown"
-        counts = (
-            f"{letters[name]} {name}: {self.warp.count(name)} warps, {self.weft.count(name)} wefts, "
-            f"{np.mean(seen == name):.0%} of the crossings"
-            for name in letters
-        )
-        lines = [
-            f"weave       {columns} warps and {rows} wefts in the tile{part}",
-            *(f"            {text}" for text in counts),
-            "",
-            f"{'draft (X: warp above)':<{max(shown[1], 21)}}   yarn above",
-        ]
-        for drawn, above in zip(self.draft[: shown[0]], seen, strict=False):
-            draft = "".join("X" if up else "." for up in drawn[: shown[1]])
-            colors = "".join(letters[name] for name in above[: shown[1]])
-            lines.append(f"{draft:<{max(shown[1], 21)}}   {colors}")
-        return lines
-
-    def letters(self) -> dict[str, str]:
-        """A letter for each name of a yarn: its first where no other name begins with it, else a, b, c, …"""
-        names = list(dict.fromkeys([*self.warp, *self.weft]))
-        first = [name[0] for name in names]
-        if len(set(first)) == len(first):
-            return dict(zip(names, first, strict=True))
-        return {name: chr(ord("a") + k % 26) for k, name in enumerate(names)}

@@ -98,14 +98,12 @@ class Role:
 
     Attributes
     ----------
-    use : in words
     effect : the effect that needs it; empty for the base layer. The weight of an effect has its name
     default : value where the effect is there and the map is not
     layer : of a layer's weight, the layer in words
     lobe : width in radians of the lobe of a roughness
     """
 
-    use: str
     effect: str = ""
     default: float | None = None
     layer: str = ""
@@ -124,17 +122,17 @@ def _fibers(roughness: float) -> float:
 
 # What each map of a material does, by role, in the order of the file.
 ROLES = {
-    "base_color": Role("reflectance"),
-    "roughness": Role("width of the specular lobe", lobe=_ggx),
-    "metallic": Role("fraction of metal", "metallic"),
-    "specular": Role("strength of the dielectric lobe", "specular"),
-    "clearcoat": Role("weight of the clear coat", "clearcoat", layer="a clear coat"),
-    "clearcoat_roughness": Role("roughness of the clear coat", "clearcoat", 0.1, lobe=_ggx),
-    "sheen": Role("weight of the sheen", "sheen", layer="a sheen"),
-    "sheen_color": Role("color of the sheen", "sheen"),
-    "sheen_roughness": Role("roughness of the sheen", "sheen", 0.3, lobe=_fibers),
-    "normal": Role("slopes that the mesh lacks", "normal"),
-    "opacity": Role("holes", "opacity"),
+    "base_color": Role(),
+    "roughness": Role(lobe=_ggx),
+    "metallic": Role("metallic"),
+    "specular": Role("specular"),
+    "clearcoat": Role("clearcoat", layer="a clear coat"),
+    "clearcoat_roughness": Role("clearcoat", 0.1, lobe=_ggx),
+    "sheen": Role("sheen", layer="a sheen"),
+    "sheen_color": Role("sheen"),
+    "sheen_roughness": Role("sheen", 0.3, lobe=_fibers),
+    "normal": Role("normal"),
+    "opacity": Role("opacity"),
 }
 # Effects of maps that a BSDF does not replace, and those of how the surface reflects.
 _BESIDE = ("normal", "opacity")

@@ -62,7 +62,7 @@ def test_a_finished_fit_is_not_trained_again(shards: Path, material: Path) -> No
     assert "already finished" not in done.err
 
 
-SMALL = "--sheet-only --size 64 --spp 1 --view 60,0 --light 60,0 --tiles-across 1"
+SMALL = "--size 64 --view 60,0 --light 60,0 --tiles-across 1"
 
 
 @pytest.fixture(scope="module")

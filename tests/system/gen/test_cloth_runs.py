@@ -98,7 +98,7 @@ def test_a_fit_knows_the_fibers_by_default_and_draws_cloth(work: Path, done: dic
     assert fitted.code == 0, fitted.err
     assert ": cloth, " in fitted.out
     assert "transmittance" in fitted.out
-    small = ["--sheet-only", "--size", "64", "--spp", "4"]
+    small = ["--size", "64"]
     drawn = call(["mbtf-fit", "preview", str(out), "-o", str(work / "drawn"), *small])
     assert drawn.code == 0, drawn.err
     with Image.open(work / "drawn/sheet.png") as picture:

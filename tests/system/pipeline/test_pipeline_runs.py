@@ -94,6 +94,9 @@ def test_images_and_numbers_are_consistent(first: dict[str, Any], folder: Path) 
         assert made["errors"]["query"]["psnr"]["value"] == pytest.approx(
             10 * np.log10(record["white"] ** 2 / mse["value"])
         )
+        # Both references converge to one image.
+        between = picture["between_references"]
+        assert abs(between["value"]) < 4 * between["error"]
     splits = record["test"]["neumip"]["splits"]
     assert set(splits) == {"test", "held_out_queries", "held_out_directions", "training"}
     assert sum(g["mse"]["n"] for g in splits["test"]["levels"].values()) == splits["test"]["n"] == 4096

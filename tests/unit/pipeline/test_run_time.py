@@ -19,9 +19,7 @@ from mbtf_core.files import folders
 from mbtf_pipeline import run as runs
 from mbtf_pipeline import run_time as module
 from mbtf_pipeline.cli.app import app
-from mbtf_pipeline.cost import forecast
-from mbtf_pipeline.cost.forecast import forecast_errors
-from mbtf_pipeline.recipe import load_recipe, preset_recipe, with_training
+from mbtf_pipeline.recipe import load_recipe, preset_recipe
 from mbtf_pipeline.run_time import RunForecaster, TimedRun, forecast_left
 from mbtf_pipeline.stages import run_stages, write_run_record
 
@@ -197,16 +195,3 @@ def test_a_draft_that_is_resumed_has_less_to_do(fake: Machine, one: Path) -> Non
     left = RunForecaster(recipe).of(recipe, [stage.name for stage in others])
     assert (left.start, left.generating) == (2.5, 0.0)
     assert forecast_left(recipe, folder, lambda: recipe) == f"{left.describe()}; faster: --time 2min"
-
-
-def test_without_data_one_command_forecasts_the_errors_of_all_fits(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recipe, shards = with_training(load_recipe(FILE), error=0.2), tmp_path / "shards"
-    texts = {found["text"] for found in forecast_errors(recipe, tmp_path, lambda note: None).values()}
-    assert texts == {f"no forecast of the error: {shards} has no data of these options yet"}
-    # Those of another preset.
-    monkeypatch.setattr(forecast, "is_dataset", lambda path: path == shards)
-    (text,) = {found["text"] for found in forecast_errors(recipe, tmp_path, lambda note: None).values()}
-    command = f"mbtf-fit {shards} --model relief --time 1min --error 0.2 --dry-run"
-    assert text.endswith(f"; of those that it has: {command}")

@@ -10,7 +10,6 @@ import pytest
 import tifffile
 from support.image_files import exr, png, rng
 
-from mbtf_core.color import linear_to_srgb, srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_core.images.read import Image, gray, read_image
 
@@ -135,16 +134,6 @@ def test_gray_is_exact_for_equal_channels_and_else_the_luminance_with_a_warning(
     assert numbers == pytest.approx(0.7152 * 0.2)
     assert "luminance" in warning
     assert "alpha" in gray(Image(np.uint8([[[255, 128]]]), Path("x.png")))[1][0]
-
-
-def test_srgb() -> None:
-    assert srgb_to_linear([0.0, 0.04045, 0.5, 1.0]) == pytest.approx(
-        [0.0, 0.0031308, 0.2140411, 1.0], abs=1e-6
-    )
-    x = np.linspace(0.0, 1.0, 1001)
-    assert linear_to_srgb(srgb_to_linear(x)) == pytest.approx(x, abs=1e-6)
-    assert srgb_to_linear(np.float32([0.5])).dtype == np.float32
-    assert np.all(np.diff(srgb_to_linear(x)) > 0)
 
 
 class TestTiff:

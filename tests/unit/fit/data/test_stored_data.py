@@ -1,10 +1,8 @@
-"""Fits to data in an object store: equal bits, a bounded cache, shards that are downloaded ahead."""
+"""Fits to data in an object store: equal bits, a bounded cache."""
 
 from __future__ import annotations
 
 import contextlib
-import threading
-import time
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -13,7 +11,7 @@ import pytest
 from support.fit_data import parallax, write_data
 from support.object_stores import memory_store
 
-from mbtf_core.data.dataset import Dataset, ahead
+from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.store import ObjectStore
 from mbtf_core.errors import PartialError
@@ -44,15 +42,14 @@ def local(tmp_path: Path, url: str) -> Path:
 
 
 @pytest.fixture
-def downloads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
-    """(shard, thread) of every download."""
-    found: list[tuple[str, str]] = []
+def downloads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The shard of every download."""
+    found: list[str] = []
     original = ObjectStore.read
 
     def watched(self: ObjectStore, name: str) -> bytes:
         if name.endswith(".npz"):
-            found.append((name, threading.current_thread().name))
-            time.sleep(0.01)
+            found.append(name)
         return original(self, name)
 
     monkeypatch.setattr(ObjectStore, "read", watched)
@@ -62,7 +59,7 @@ def downloads(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
 def cached(folder: Path) -> int:
     found = 0
     for path in (folder / "cache/mbtf/stores/shards").iterdir():
-        # Threads that read ahead make room meanwhile.
+        # The thread that reads the next batch makes room meanwhile.
         with contextlib.suppress(FileNotFoundError):
             found += path.stat().st_size
     return found
@@ -78,32 +75,17 @@ def test_a_fit_is_identical(tmp_path: Path, url: str, local: Path, memory: str, 
     assert all((mine[name] == theirs[name]).all() for name in mine)
 
 
-def test_shards_are_downloaded_once(url: str, local: Path, downloads: list[tuple[str, str]]) -> None:
+def test_shards_are_downloaded_once(url: str, local: Path, downloads: list[str]) -> None:
     data = Dataset.open(url)
     training = load_training(data, HELD_OUT, 0, memory=1.0).training
-    names = [name for name, _ in downloads]
-    assert sorted(names) == [path.name for path in sorted(local.glob("train-*.npz"))]
+    assert sorted(downloads) == [path.name for path in sorted(local.glob("train-*.npz"))]
     list(islice(training.batches(700, 0, 0), 30))  # type: ignore[arg-type, call-overload]
-    assert len(downloads) == len(names)
+    assert len(downloads) == 8
 
 
-def test_the_shards_after_the_one_that_is_read_are_downloaded_ahead(
-    url: str, local: Path, downloads: list[tuple[str, str]]
-) -> None:
-    next(ahead(Dataset.open(url).shards("train"))).read()
-    give_up = time.monotonic() + 60.0
-    while len(downloads) < 3 and time.monotonic() < give_up:
-        time.sleep(0.01)
-    here = threading.current_thread().name
-    names = [("train-00000.npz", here), ("train-00001.npz", "prefetch"), ("train-00002.npz", "prefetch")]
-    assert sorted(downloads) == names
-
-
-def test_the_cache_is_bounded(
-    tmp_path: Path, url: str, local: Path, downloads: list[tuple[str, str]]
-) -> None:
+def test_the_cache_is_bounded(tmp_path: Path, url: str, local: Path, downloads: list[str]) -> None:
     size = max(path.stat().st_size for path in local.glob("train-*.npz"))
-    data = Dataset.open(url, cache=5 * size)  # also without reading ahead
+    data = Dataset.open(url, cache=5 * size)
     training = load_training(data, HELD_OUT, 0, memory=1.0).training
     for _ in islice(training.batches(700, 0, 0), 30):  # type: ignore[arg-type, call-overload]
         assert cached(tmp_path) <= 6 * size
@@ -153,19 +135,3 @@ def test_a_lost_store_leaves_a_checkpoint(
     found = result.material.model.weights()
     assert result.resumed
     assert all((whole[name] == found[name]).all() for name in whole)
-
-
-def test_failures_of_the_background_are_left_to_the_reader(
-    url: str, local: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shard = Dataset.open(url).shards("train")[1]
-    with monkeypatch.context() as patch:
-        patch.setattr(ObjectStore, "read", _unreachable)
-        shard.prefetch()
-        with pytest.raises(PartialError):
-            shard.read()
-    shard.read()
-
-
-def _unreachable(*_: object) -> None:
-    raise PartialError("the store cannot be reached")

@@ -19,12 +19,10 @@ from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.queries import ShardQueries, TrainingQueries
 from mbtf_fit.objective.parallel import Workers
 from mbtf_fit.sections import TrainingSection
-from mbtf_fit.training.loop import TrainingLoop, restore, snapshot, state_tensors
 from mbtf_fit.training.suitable_data import open_data
 from mbtf_fit.training.trainer import (
     Regularization,
     Trainer,
-    TrainingProgress,
     learning_rate_factor,
     prepare_trainer,
 )
@@ -144,17 +142,6 @@ def test_a_time_budget_takes_its_fewest_steps() -> None:
     assert trainer(queries(), steps=None, time="1h, at least 1 steps").fraction == 0.0
 
 
-def test_a_snapshot_keeps_a_state_however_often_training_goes_on() -> None:
-    loop = TrainingLoop([trainer(queries())])
-    loop.train(0.0)
-    expected = {name: tensor.tolist() for name, tensor in state_tensors(loop).items()}
-    start = snapshot(loop)
-    for _ in range(2):
-        loop.train(0.0)
-        restore(loop, start, TrainingProgress(1))
-        assert {name: tensor.tolist() for name, tensor in state_tensors(loop).items()} == expected
-
-
 def test_each_texture_keeps_its_least_blur() -> None:
     t = train_fully(trainer(queries(), blur={"min_sigma": 0.7, "offset_sigma": 0.3}))
     pyramid, offset = t.model.textures()
@@ -246,8 +233,8 @@ def test_weights_of_the_position_decay_more_and_biases_not(
 
 def test_texels_without_a_network_are_not_regularized() -> None:
     t = trainer(queries(), "svbrdf")
-    t.noise = replace(t.noise, ratio=5.0)
-    assert t.regularization_of(1000).texels == 0.0
+    noisy = Trainer(t.config, t.model, t.queries, replace(t.noise, ratio=5.0))
+    assert noisy.regularization.texels == 0.0
 
 
 def test_a_fit_estimates_the_noise_ratio_of_its_data(tmp_path: Path) -> None:
