@@ -23,7 +23,15 @@ from mbtf_fit.export import Export, ExportTarget
 from mbtf_fit.export.checks import check_stored
 from mbtf_fit.export.json import LAYERS_NAME
 from mbtf_fit.export.json import write as write_layers
-from mbtf_fit.material.texture_formats import BLOCK, QUANTIZED, TextureFormat, decode, encode, grouped
+from mbtf_fit.material.texture_formats import (
+    BLOCK,
+    QUANTIZED,
+    UNBLOCKED,
+    TextureFormat,
+    decode,
+    encode,
+    grouped,
+)
 from mbtf_fit.ops.constants import FIBERS, HEIGHTS, HORIZONS, MAPS
 
 _TEXTURES = ("pyramid", "offset_texture", "features", MAPS, FIBERS, HORIZONS, HEIGHTS)
@@ -76,7 +84,7 @@ def read_dds(data: bytes, like: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
 def _check(name: str, shapes: Sequence[tuple[int, ...]], form: TextureFormat) -> None:
     if name not in _TEXTURES:
         raise InputError(f"has no place for the texture '{name}'", where="--to dds")
-    if form == "bc4" and (shapes[-1][0] % BLOCK or shapes[-1][1] % BLOCK):
+    if form == "bc4" and name not in UNBLOCKED and (shapes[-1][0] % BLOCK or shapes[-1][1] % BLOCK):
         what = f"hardware needs multiples of 4 texels, and '{name}' has {shapes[-1][0]} x {shapes[-1][1]}"
         raise InputError(what, where="--to dds", hint="export with --texture-format unorm8")
     for (r, c, *_), (rows, columns, *_) in pairwise(shapes):

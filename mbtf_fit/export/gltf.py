@@ -29,7 +29,8 @@ def gltf(maps: Maps, name: str, described: dict[str, Any]) -> str:
     }
     views, accessors, data = [], [], b""
     for n, (name, array) in enumerate(arrays.items()):
-        views.append(gl.BufferView(buffer=0, byteOffset=len(data), byteLength=array.nbytes))
+        target = gl.ELEMENT_ARRAY_BUFFER if array.dtype == np.uint16 else gl.ARRAY_BUFFER
+        views.append(gl.BufferView(buffer=0, byteOffset=len(data), byteLength=array.nbytes, target=target))
         data += array.tobytes()
         accessor = gl.Accessor(
             bufferView=n,

@@ -10,8 +10,9 @@ Textures are rounded after training. Steps that read rounded textures, with grad
 leave the same error: a ratio of 1.000 ± 0.004 over seven pairs of fits.
 
 Heights have 16 bits in both formats, as view rays are traced to them, and maps 8: highlights depend on their
-slopes and roughness, which in blocks add a tenth to the error of glossy `turtle_shell`. What has been decoded
-is encoded to the same numbers again: end points are the extremes of a block.
+slopes and roughness, which in blocks add a tenth to the error of glossy `turtle_shell`. Horizons have 8 bits
+too, as their variance is a difference; ``bc4`` leaves out their finest level, and lookups read the next. What
+has been decoded is encoded to the same numbers again: end points are the extremes of a block.
 """
 
 from __future__ import annotations
@@ -22,11 +23,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_fit.ops.constants import HEIGHTS, MAPS
+from mbtf_fit.ops.constants import HEIGHTS, HORIZONS, MAPS
 
 TextureFormat = Literal["float32", "float16", "unorm8", "bc4"]
 # Those with a range.
 QUANTIZED: tuple[TextureFormat, ...] = ("unorm8", "bc4")
+# Textures of whole numbers in both.
+UNBLOCKED = (HEIGHTS, HORIZONS, MAPS)
 # Texels along a side of a block, and steps between its end points.
 BLOCK, STEPS = 4, 7
 # Difference of places that single precision explains.
@@ -98,7 +101,7 @@ def encode(name: str, levels: Sequence[F32], form: TextureFormat) -> tuple[list[
     shares = [(x - low) * scale for x in levels]
     if name == HEIGHTS:
         codes: list[NDArray[Any]] = [np.rint(65535.0 * x).astype(np.uint16) for x in shares]
-    elif form == "bc4" and name != MAPS:
+    elif form == "bc4" and name not in UNBLOCKED:
         codes = [encode_blocks(255.0 * x) for x in shares]
     else:
         codes = [np.rint(255.0 * x).astype(np.uint8) for x in shares]

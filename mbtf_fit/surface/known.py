@@ -77,7 +77,8 @@ class KnownSurface:
     maps : tuple of (rows, columns, channels) tensors
         Prefiltered maps by level, coarsest first: levels 0 to k, or to k + 1 where lookups are finer.
     horizons : tuple of (rows, columns, 2·azimuths) tensors
-        Prefiltered horizon angles in radians by level, then their squares: levels 0 to k.
+        Prefiltered horizon angles in radians by level, then their squares: levels 0 to k, or to k - 1 in the
+        format ``bc4``.
     light_width : RMS angle per axis of the light kernel, in radians
     dielectric : F0 of the surface where it is no metal
     fibers : tuple of (rows, columns, 7) tensors
@@ -147,7 +148,6 @@ class KnownSurface:
         KeyError : a tensor is missing
         ValueError : a tensor has the shape of another lattice, or is no surface below the reference plane
         """
-        levels = range(lattice.finest + 1)
         finer = Lattice(lattice.finest + 1, lattice.aspect)
         heights = _take(tensors, HEIGHTS, (None, None, 1))[..., 0]
         if heights.numel() == 0 or not bool((heights <= 0).all() and heights.isfinite().all()):
@@ -157,6 +157,7 @@ class KnownSurface:
             raise ValueError(f"'{MAPS}.0'")
         stored = range(finer.finest + (f"{MAPS}.{finer.finest}" in tensors))
         fibers = stored if f"{FIBERS}.0" in tensors else ()
+        levels = range(max(1, lattice.finest + (f"{HORIZONS}.{lattice.finest}" in tensors)))
         return cls(
             lattice,
             heights,

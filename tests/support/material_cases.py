@@ -11,6 +11,7 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_fit import ops
 from mbtf_fit.config import FitConfig
 from mbtf_fit.material.material import Material, export
+from mbtf_fit.material.rounding import round_material
 from mbtf_fit.material.transmittance import Transmittance
 from mbtf_fit.pytorch.material import NeuralMaterial
 
@@ -43,7 +44,7 @@ CASES: dict[str, dict[str, Any]] = {
     "learned heights": {"model": "neumip+"},
     "cloth": {"model": "cloth", "glossy": False, **net(relief={"places": 2})},
     "black": {"model": "relief", "weights": {"unit": torch.zeros(())}},
-    "bounded": {"model": "relief", "weights": {"most": torch.tensor(0.5)}},
+    "bounded, in blocks": {"model": "relief", "weights": {"most": torch.tensor(0.5)}},
     "rainer2019": {"model": "rainer2019"},
     "svbrdf": {"model": "svbrdf"},
     "zeltner2024": {"model": "zeltner2024", **net(width=12, layers=3)},
@@ -122,4 +123,8 @@ def make(case: str, folder: Path, **more: Any) -> Material:
         shapes = [(*lattice.shape(s), 6) for s in range(5)]
         coefficients = [0.3 + 0.2 * torch.randn(s, generator=generator).numpy() for s in shapes]
         options["transmittance"] = Transmittance(lattice, coefficients)
-    return write_material(folder, **options)
+    material = write_material(folder, **options)
+    if not case.endswith("in blocks"):
+        return material
+    model = round_material(material, "bc4")[0].model
+    return export(model, material.config, folder, data={"hash": "0" * 64}, training=TRAINING, form="bc4")

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import base64
 import json
+import os
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +81,30 @@ def test_images_hold_the_maps(glossy: Path) -> None:
     np.testing.assert_allclose(color, fitted.base_color, atol=0.01)
 
 
+VALIDATE = """
+const [fs, path] = [require("fs"), require("path")], [file] = process.argv.slice(1);
+const read = async (name) => new Uint8Array(fs.readFileSync(path.join(path.dirname(file), name)));
+read(path.basename(file))
+  .then((bytes) => require("gltf-validator").validateBytes(bytes, { externalResourceFunction: read }))
+  .then((report) => console.log(JSON.stringify(report.issues.messages)));
+"""
+
+
+def test_gltf_is_valid_for_khronos(glossy: Path) -> None:
+    if shutil.which("npm") is None:
+        pytest.skip("no npm; to enable on Debian: apt-get install npm")
+    modules = subprocess.run(["npm", "root", "-g"], check=True, capture_output=True, text=True).stdout.strip()
+    if not (Path(modules) / "gltf-validator").is_dir():
+        pytest.skip("no gltf-validator; to enable: npm install -g gltf-validator")
+    command, environment = ["node", "-e", VALIDATE], os.environ | {"NODE_PATH": modules}
+    for text, faults in ((glossy / "material.gltf").read_text(), 0), ("{}", 1):
+        (glossy / "checked.gltf").write_text(text)
+        found = subprocess.run(
+            [*command, str(glossy / "checked.gltf")], check=True, capture_output=True, env=environment
+        )
+        assert len(json.loads(found.stdout)) == faults, found.stdout
+
+
 def test_gltf(glossy: Path) -> None:
     pygltflib = pytest.importorskip("pygltflib")
     document = pygltflib.GLTF2().load(str(glossy / "material.gltf"))
@@ -118,9 +145,12 @@ def test_gltf(glossy: Path) -> None:
 
 def test_usd(glossy: Path) -> None:
     pytest.importorskip("pxr")
-    from pxr import Usd, UsdGeom, UsdShade
+    from pxr import Usd, UsdGeom, UsdShade, UsdValidation
 
     stage = Usd.Stage.Open(str(glossy / "material.usda"))
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert len(validators) > 20
+    assert UsdValidation.ValidationContext(validators).Validate(stage) == []
     mesh = stage.GetPrimAtPath("/Tile/Plane")
     bound, _ = UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()
     surface = bound.ComputeSurfaceSource()[0]

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from support.browser import SOFTWARE, browser
 from support.material_cases import CASES, make
 from support.slang_device import SlangDevice
 
@@ -217,36 +218,102 @@ MARKS = {
 }
 
 
-@pytest.mark.parametrize("more", [[], ["--texture-format", "float16", "--shader-networks", "cooperative"]])
-def test_other_languages(
-    more: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("SLANG_RUN_SPIRV_VALIDATION", "1")
-    make("relief", tmp_path / "material")
+COOPERATIVE = ["--texture-format", "float16", "--shader-networks", "cooperative"]
+
+
+def _command(folder: Path, more: list[str]) -> list[str]:
+    """What exports to Slang alone."""
+    return ["export", str(folder / "material"), "--to", "slang", *more, "-o", str(folder / "out"), "-q"]
+
+
+def _languages(more: list[str]) -> list[str]:
     targets = [target for target in ENDINGS if not more or target not in PLAIN_TARGETS]
-    words = [word for target in targets for word in ("--shader-target", target)]
-    out = tmp_path / "out"
-    command = ["export", str(tmp_path / "material"), "--to", "slang", *more, "-o", str(out), "-q"]
-    assert run(app, [*command, *words]) == 0
+    return [word for target in targets for word in ("--shader-target", target)]
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[bool, Path]:
+    """Folders of a material in all languages, without and with cooperative vectors."""
+    out = {}
+    with pytest.MonkeyPatch.context() as patch:
+        # By the SPIRV-Tools of Slang.
+        patch.setenv("SLANG_RUN_SPIRV_VALIDATION", "1")
+        for more in ([], COOPERATIVE):
+            folder = out[bool(more)] = tmp_path_factory.mktemp("languages")
+            make("relief", folder / "material")
+            assert run(app, [*_command(folder, more), *_languages(more)]) == 0
+    return out
+
+
+@pytest.mark.parametrize("more", [[], COOPERATIVE])
+def test_other_languages(more: list[str], exported: dict[bool, Path]) -> None:
+    words, out = _languages(more), exported[bool(more)] / "out"
     before = {path.name: path.read_bytes() for path in out.iterdir()}
-    assert len(before) == 3 + len(targets)
+    assert len(before) == 3 + len(words) / 2
     marks = MARKS | ({".hlsl": b"linalg_MulAdd", ".spv": COOPERATIVE_VECTOR} if more else {})
     assert (b"#define HALF_TEXELS" in before["material.slang"]) == bool(more)
     for name, text in before.items():
         assert marks.get(Path(name).suffix, b"") in text, name
-    if shutil.which("g++"):
-        subprocess.run(["g++", "-fsyntax-only", "-w", str(out / "material.cpp")], check=True)
-    if shutil.which("nvcc"):
-        ptx = ["nvcc", "-ptx", "-w", "-o", str(tmp_path / "material.ptx"), str(out / "material.cu")]
-        subprocess.run(ptx, check=True)
     if not more:
-        assert run(app, [*command, *words]) == 0
+        assert run(app, [*_command(exported[False], more), *words]) == 0
         assert {path.name: path.read_bytes() for path in out.iterdir()} == before
-    else:
-        assert run(app, [*command, "--shader-target", "metal", "--overwrite"]) == 2
-        assert "Slang has no cooperative vectors for metal" in capsys.readouterr().err
-        assert run(app, [*command, "--overwrite"]) == 2
-        assert "add --shader-target" in capsys.readouterr().err
+
+
+def test_what_has_no_cooperative_vectors_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make("relief", tmp_path / "material")
+    command = _command(tmp_path, COOPERATIVE)
+    assert run(app, [*command, "--shader-target", "metal"]) == 2
+    assert "Slang has no cooperative vectors for metal" in capsys.readouterr().err
+    assert run(app, command) == 2
+    assert "add --shader-target" in capsys.readouterr().err
+
+
+COMPILERS = {
+    ".cpp": "g++ -fsyntax-only -w",
+    ".cu": "nvcc -ptx -w",
+    ".comp": "glslangValidator -V",
+    ".hlsl": "glslangValidator -D -V -S comp -e evaluate_queries",
+}
+
+
+@pytest.mark.parametrize("cooperative", [False, True])
+@pytest.mark.parametrize("ending", COMPILERS)
+def test_compilers_accept_them(
+    ending: str, cooperative: bool, exported: dict[bool, Path], tmp_path: Path
+) -> None:
+    compiler, *flags = COMPILERS[ending].split()
+    if shutil.which(compiler) is None:
+        pytest.skip(
+            f"no {compiler}; to enable on Debian: apt-get install g++ glslang-tools nvidia-cuda-toolkit"
+        )
+    if ending == ".hlsl" and cooperative:
+        pytest.skip("glslang knows no cooperative vectors of HLSL")
+    file = exported[cooperative] / f"out/material{ending}"
+    subprocess.run([compiler, *flags, "-o", str(tmp_path / "compiled"), str(file)], check=True)
+
+
+WEBGPU = """
+const [code, done] = arguments;
+(async () => {
+  const device = await (await navigator.gpu.requestAdapter()).requestDevice();
+  const { messages } = await device.createShaderModule({ code }).getCompilationInfo();
+  done(messages.map((m) => `${m.type} in line ${m.lineNum}: ${m.message}`));
+})().catch((error) => done([String(error)]));
+"""
+
+
+def test_browsers_accept_wgsl(exported: dict[bool, Path], tmp_path: Path) -> None:
+    flags = ("--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader", "--enable-features=Vulkan")
+    # WebGPU needs a secure context, which files are.
+    (tmp_path / "page.html").write_text("<!doctype html>")
+    code = (exported[False] / "out/material.wgsl").read_text()
+    with browser(tmp_path / "profile", (*SOFTWARE, *flags)) as driver:
+        driver.get((tmp_path / "page.html").as_uri())
+        assert driver.execute_async_script(WEBGPU, code) == []
+        (message,) = driver.execute_async_script(WEBGPU, code + "fn")
+        assert message.startswith("error in line")
 
 
 def test_the_documented_function_compiles(tmp_path: Path) -> None:
