@@ -38,9 +38,9 @@ QUERIES, LIGHTS = 1 << 13, 32
 # comparison with the cosine.
 SHARE, LEAST = 1 / 8, 512
 # Steps of a round of most queries, and fewest: in 18 steps, no lobe becomes as narrow as brushed metal's.
-ROUNDS, STEPS, LEAST_STEPS, BATCH = 2, 600, 100, 256
-# Reached slowly: at this rate from the start, the reflection loses its weight before it finds a highlight.
-LEARNING_RATE = 2e-2
+ROUNDS, STEPS, LEAST_STEPS, BATCH = 2, 600, 200, 256
+# Largest. Of twice this rate from the start, the reflection loses its weight before it finds a highlight.
+LEARNING_RATE = 1e-2
 # Least reduction of the second moment that is worth the network's evaluation.
 GAIN = 0.01
 # The reflection at the start, which half of the directions are of.
