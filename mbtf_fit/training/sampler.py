@@ -39,10 +39,10 @@ QUERIES, LIGHTS = 1 << 13, 32
 SHARE, LEAST = 1 / 8, 512
 # Steps of a round of most queries, and fewest: in 18 steps, no lobe becomes as narrow as brushed metal's.
 ROUNDS, STEPS, LEAST_STEPS, BATCH = 2, 600, 200, 256
-# Largest. Of twice this rate from the start, the reflection loses its weight before it finds a highlight.
+# Largest. At twice this rate from the start, the reflection loses its weight before it finds a highlight.
 LEARNING_RATE = 1e-2
-# Least reduction of the second moment that is worth the network's evaluation.
-GAIN = 0.01
+# Least relative reduction of the second moment; that of a Lambert material varies by less.
+GAIN = 1e-3
 # The reflection at the start, which half of the directions are of.
 FIRST_ALPHA = 0.4
 # Where a query reflects little, its variance counts less: δ, as a share of the mean of I².
