@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
-from support.fit_data import parallax, write_data
+from numpy.typing import NDArray
+from support.fit_data import F32, Function, constant, write_data
 
 from mbtf_core.app.console import run
 from mbtf_fit import FitConfig, Material, fit
@@ -15,11 +17,25 @@ from mbtf_fit.ops import Lookup, Network
 from mbtf_fit.ops.operation import Operation, sizes_of
 
 
+def highlight(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> NDArray[np.float64]:
+    """A wide one about the mirror direction."""
+    away = np.square(omega_i[:, :2] + omega_o[:, :2]).sum(1)
+    return np.repeat(np.exp(-away[:, None] / 0.2, dtype=np.float64), 3, 1)
+
+
 @pytest.mark.parametrize(
-    ("steps", "wanted", "sampled"), [(20, True, True), (8, True, False), (20, False, False)]
+    ("function", "steps", "wanted", "sampled"),
+    [
+        (highlight, 20, True, True),
+        (constant(0.3), 20, True, False),
+        (highlight, 8, True, False),
+        (highlight, 20, False, False),
+    ],
 )
-def test_fits_have_a_sampler_but_short_ones(steps: int, wanted: bool, sampled: bool, tmp_path: Path) -> None:
-    data = write_data(tmp_path / "data", parallax, train=20_000)
+def test_fits_of_highlights_have_a_sampler_but_short_ones(
+    function: Function, steps: int, wanted: bool, sampled: bool, tmp_path: Path
+) -> None:
+    data = write_data(tmp_path / "data", function, train=20_000)
     training = {"steps": steps, "importance_sampling": wanted}
     config = FitConfig.model_validate({"model": "neumip", "training": training})
     sampler = fit(config, data, tmp_path / "fit").material.sampler
