@@ -34,7 +34,6 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import generate
 from mbtf_gen.job import Job
 from mbtf_pipeline.cost.measurement import Conditions, Configuration, Measurement
-from mbtf_pipeline.run_time import round_down
 
 if TYPE_CHECKING:
     from mbtf_fit.data.queries import ShardQueries
@@ -161,7 +160,7 @@ def planned_runs(seconds: float, spp: int, path_seconds: float, step_seconds: fl
         if runs and (total > left or (1 - share) * total < FEWEST_STEPS * step_seconds):
             continue
         left -= total
-        queries = round_down(max(_FEWEST_QUERIES, share * total / (spp * path_seconds)))
+        queries = _round_down(max(_FEWEST_QUERIES, share * total / (spp * path_seconds)))
         training = (1 - share) * total
         fit = {
             "model": DEFAULT_MODEL,
@@ -219,3 +218,9 @@ def _evaluation_seconds(material: Any, test: ShardQueries) -> float:
     timer = time.perf_counter
     seconds = min(timeit.repeat(lambda: material.evaluate(*arrays), timer=timer, number=1, repeat=_TIMED))
     return seconds * PIXELS / _TIMED_QUERIES
+
+
+def _round_down(count: float) -> int:
+    """A number of queries with two significant digits."""
+    digits = 10 ** max(0, len(str(int(count))) - 2)
+    return max(1, int(count / digits) * digits)
