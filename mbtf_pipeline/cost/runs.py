@@ -38,8 +38,6 @@ from mbtf_pipeline.cost.measurement import Conditions, Configuration, Measuremen
 if TYPE_CHECKING:
     from mbtf_fit.data.queries import ShardQueries
 
-# Most seeds of a run.
-MOST_SEEDS = 12
 # Shares of a study's time that the generator and the runs get. The rest is left for start-up, the test set,
 # loading and evaluation.
 GENERATOR, RUNS = 0.1, 0.7
