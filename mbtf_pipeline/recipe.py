@@ -104,7 +104,6 @@ class ReportSection(Settings):
 
     title: str | None = Field(None, description="title; default: the recipe's name")
     exposure: Exposure = Field(ALBEDO_EXPOSURE, description=EXPOSURE)
-    max_megabytes: float = Field(9.5, ge=1, le=100, description="size limit of the file")
 
 
 def is_single(fits: Mapping[str, Any]) -> bool:
@@ -146,7 +145,7 @@ class Recipe(Settings):
     compare : CompareSection
         Views, lights and size of the compared images.
     report : ReportSection
-        Title, exposure and size of the report.
+        Title and exposure of the report.
     """
 
     exclusive = (*GeneratorConfig.exclusive, *FitConfig.exclusive)
