@@ -251,9 +251,7 @@ def best_at(quality: Quality, model: ModelName = DEFAULT_MODEL) -> dict[str, Any
     return best_options(math.inf if training is None else parse_duration(training), model)
 
 
-def fitter_options(
-    quality: Quality, fits: Mapping[str, Mapping[str, Any]], seconds: float | None = None
-) -> dict[str, dict[str, Any]]:
+def fitter_options(quality: Quality, fits: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     """Options of fits at a quality preset, dotted names: their budget, and :func:`best_at`. Explicit values
     override the preset.
 
@@ -262,7 +260,6 @@ def fitter_options(
     Parameters
     ----------
     fits : name → explicit options of files and command line, nested, with the model
-    seconds : training time that decides the network; the preset's by default
     """
     free = not any(
         "network" in given or given.get("init_from") or given.get("decoder") for given in fits.values()
@@ -272,10 +269,9 @@ def fitter_options(
         training = given.get("training")
         training = training if isinstance(training, Mapping) else {}
         model = given.get("model", DEFAULT_MODEL)
-        best = best_at(quality, model) if seconds is None else best_options(seconds, model)
         kept = {
             key: value
-            for key, value in best.items()
+            for key, value in best_at(quality, model).items()
             if (free if key.startswith("network.") else key.split(".")[1] not in training)
         }
         budget = dict(FITTER[quality])

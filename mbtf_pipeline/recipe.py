@@ -104,7 +104,6 @@ class ReportSection(Settings):
 
     title: str | None = Field(None, description="title; default: the recipe's name")
     exposure: Exposure = Field(ALBEDO_EXPOSURE, description=EXPOSURE)
-    max_megabytes: float = Field(9.5, ge=1, le=100, description="size limit of the file")
 
 
 def is_single(fits: Mapping[str, Any]) -> bool:
@@ -146,7 +145,7 @@ class Recipe(Settings):
     compare : CompareSection
         Views, lights and size of the compared images.
     report : ReportSection
-        Title, exposure and size of the report.
+        Title and exposure of the report.
     """
 
     exclusive = (*GeneratorConfig.exclusive, *FitConfig.exclusive)
@@ -247,12 +246,9 @@ def load_recipe(
     return recipe.model_copy(update={"generate": generate})
 
 
-def quality_options(
-    path: Path, quality: Quality | None, assignments: Sequence[str] = (), training: float | None = None
-) -> dict[str, Any]:
+def quality_options(path: Path, quality: Quality | None, assignments: Sequence[str] = ()) -> dict[str, Any]:
     """Options, by dotted key, that apply a preset to the recipe of a file, where ``a.b=c`` will override
-    them; an InputError where the file cannot be read. Seconds of training decide the networks, by default the
-    preset's."""
+    them; an InputError where the file cannot be read."""
     if quality is None:
         return {}
     given = explicit_options(path, assignments, read_recipe)
@@ -263,18 +259,15 @@ def quality_options(
         own = {"fit": {"model": DEFAULT_MODEL, **(fits if isinstance(fits, Mapping) else {})}}
     preset = generator_options(quality, generate if isinstance(generate, Mapping) else {})
     out = COMPARE[quality] | {f"generate.{key}": value for key, value in preset.items()}
-    for prefix, options in fitter_options(quality, own, training).items():
+    for prefix, options in fitter_options(quality, own).items():
         out |= {f"{prefix}.{key}": value for key, value in options.items()}
     return out
 
 
-def preset_recipe(
-    path: Path, quality: Quality | None, assignments: Sequence[str] = (), training: float | None = None
-) -> Recipe:
-    """The recipe of a file at a quality preset, which ``a.b=c`` override; `training` is as in
-    :func:`quality_options`. An InputError where file or material cannot be read, a UsageError where an
-    assignment is invalid."""
-    preset = quality_options(path, quality, assignments, training)
+def preset_recipe(path: Path, quality: Quality | None, assignments: Sequence[str] = ()) -> Recipe:
+    """The recipe of a file at a quality preset, which ``a.b=c`` override. An InputError where file or
+    material cannot be read, a UsageError where an assignment is invalid."""
+    preset = quality_options(path, quality, assignments)
     recipe = load_recipe(path, assignments, presets=preset)
     if f"generate.{RESOLUTION}" not in preset:
         return recipe
@@ -283,9 +276,9 @@ def preset_recipe(
     return recipe.model_copy(update={"generate": limit_resolution(Job.load(recipe.generate)).config})
 
 
-def with_training(recipe: Recipe, **options: Any) -> Recipe:
-    """The recipe with training options of all its fits."""
-    changes = {"training": options}
+def with_error(recipe: Recipe, error: float) -> Recipe:
+    """The recipe with an error at which the training of each fit stops."""
+    changes = {"training": {"error": error}}
     fits = {n: FitConfig.model_validate(deep_merge(f.model_dump(), changes)) for n, f in recipe.fit.items()}
     return recipe.model_copy(update={"fit": fits})
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -299,7 +299,6 @@ def run_recipe(
     force: bool = False,
     command: str = "",
     console: Console | None = None,
-    generated: Callable[[Recipe], Recipe] | None = None,
     live: LiveView | None = None,
     runner: Runner | None = None,
 ) -> RunResult:
@@ -317,8 +316,6 @@ def run_recipe(
         Command that the report shows for reproduction.
     console : Console, optional
         Receives progress; quiet by default.
-    generated : callable, optional
-        Called once the data are generated; returns the recipe of the other stages.
     live : LiveView, optional
         Shows stages and fits as they come.
     runner : Runner, optional
@@ -337,15 +334,9 @@ def run_recipe(
         Another process uses the folder, or the disk is full; the same command resumes the run.
     """
     folder = recipe.folder if folder is None else folder
-    inputs, count = _material_inputs(recipe), len(data_sets(recipe))
     run = _RecipeRun(recipe, folder, console or Console(quiet=True), live, runner or Runner())
     with _claimed(recipe, folder, command, force):
-        done = run_stages(folder, run.stages(inputs)[:count], force=force, notify=run.show)
-        if generated is not None:
-            run = replace(run, recipe=generated(recipe))
-            write_run_record(folder, run.recipe, command, overwrite=force)
-        left = run.stages(inputs)[count:]
-        results = run_stages(folder, left, force=force, notify=run.show, before=done)
+        results = run_stages(folder, run.stages(_material_inputs(recipe)), force=force, notify=run.show)
     viewer, comparison = folder / VIEWER, read_json(folder / COMPARE / COMPARISON_NAME)
     return RunResult(folder / REPORT, viewer if viewer.is_file() else None, results, comparison)
 

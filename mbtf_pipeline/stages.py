@@ -177,13 +177,10 @@ def run_stages(
     *,
     force: bool = False,
     notify: Notify = lambda name, decision, seconds: None,
-    before: Mapping[str, StageResult] | None = None,
 ) -> dict[str, StageResult]:
-    """Run all stages that are not up to date, in the given order; all of them if forced.
-
-    Returns their results after those of the stages that ran `before`.
-    """
-    done = dict(before or {})
+    """Run all stages that are not up to date, in the given order; all of them if forced. Returns their
+    results by name."""
+    done: dict[str, StageResult] = {}
 
     def decided(stage: Stage) -> Decision:
         fresh = [name for name, result in done.items() if result.reason]

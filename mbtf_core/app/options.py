@@ -70,7 +70,6 @@ MovedMaterial = Annotated[
     Parameter(name="--material", metavar="PATH", help="Path of the material, if it was moved."),
 ]
 Overwrite = Annotated[Switch, Parameter(help="Replace existing output.")]
-Time = Annotated[str | None, Parameter(metavar="DURATION", help="Time budget: 90s, 2min, 1h.")]
 ErrorOption = Annotated[
     float | None,
     Parameter(

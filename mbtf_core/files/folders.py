@@ -104,16 +104,11 @@ def check_folder(folder: Path, is_ours: Callable[[Path], bool], what: str) -> bo
     return False
 
 
-def free_space(folder: Path) -> int:
-    """Free bytes on the disk of a folder, which need not exist yet."""
-    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
-    return shutil.disk_usage(there).free
-
-
 def check_space(folder: Path, size: float, hint: str) -> None:
-    """Refuse output of this size, in bytes, that does not fit on the disk of its folder; `hint` names the
-    option to change."""
-    free = free_space(folder)
+    """Refuse output of this size, in bytes, that does not fit on the disk of its folder, which need not exist
+    yet; `hint` names the option to change."""
+    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    free = shutil.disk_usage(there).free
     if size > free:
         raise InputError(f"needs {size_text(size)}; {size_text(free)} are free", where=folder, hint=hint)
 

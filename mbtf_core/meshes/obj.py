@@ -16,7 +16,7 @@ from mbtf_core.meshes.companions import Companions
 from mbtf_core.meshes.content import F64, MeshContent, MeshShape, groups_of, with_colors
 from mbtf_core.meshes.mtl import MtlMaterial, as_text, material_values, read_mtl
 from mbtf_core.meshes.numbers import parse, read_bytes, words_per_line
-from mbtf_core.meshes.polygons import UNCUT, triangulate
+from mbtf_core.meshes.polygons import CROSSING, triangulate
 from mbtf_core.paths import suggest_name
 
 I64 = NDArray[np.int64]
@@ -37,7 +37,7 @@ def read_obj(path: Path) -> MeshContent:
     positions, colors = lines.positions()
     uv, normals = lines.vectors(b"vt", 2), lines.vectors(b"vn", 3)
     corners, sizes, run = lines.corners((positions, uv, normals))
-    triangles, polygon, uncut = triangulate(positions[corners[:, 0]], sizes)
+    triangles, polygon, crossing = triangulate(positions[corners[:, 0]], sizes)
     if not len(triangles):
         raise InputError("has no triangles", where=path)
     companions = Companions(path)
@@ -54,8 +54,10 @@ def read_obj(path: Path) -> MeshContent:
             name = f"{part}, {name}"
         shape = MeshShape(name or part or path.name, **arrays, values=values, faults=faults)
         shapes.append(with_colors(shape, path, materials.warnings))
-    warnings = [*lines.warnings, *([UNCUT.format(uncut)] if uncut else []), *materials.all_warnings()]
-    return MeshContent(shapes, companions.files, None, [*warnings, *companions.warnings])
+    warnings = [*lines.warnings, *materials.all_warnings(), *companions.warnings]
+    if crossing:
+        warnings.append(CROSSING.format(crossing))
+    return MeshContent(shapes, companions.files, None, warnings)
 
 
 class _Lines:

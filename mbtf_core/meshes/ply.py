@@ -16,7 +16,7 @@ from mbtf_core.meshes.companions import Companions
 from mbtf_core.meshes.content import F64, I64, MeshContent, MeshShape, Texture, groups_of, with_colors
 from mbtf_core.meshes.mtl import as_text
 from mbtf_core.meshes.numbers import parse, read_bytes
-from mbtf_core.meshes.polygons import UNCUT, triangulate
+from mbtf_core.meshes.polygons import CROSSING, triangulate
 
 _TYPES = {
     **{name: name for name in ("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64")},
@@ -257,7 +257,7 @@ def read_ply(path: Path) -> MeshContent:
     if not ((stored >= 0) & (stored < len(positions)) & (stored == np.floor(stored))).all():
         raise InputError(f"a face has a vertex that the file lacks; there are {len(positions):,}", where=path)
     number = stored.astype(np.int64)
-    triangles, polygon, uncut = triangulate(positions[number], sizes)
+    triangles, polygon, crossing = triangulate(positions[number], sizes)
     if not len(triangles):
         raise InputError("has no triangles", where=path)
 
@@ -288,8 +288,8 @@ def read_ply(path: Path) -> MeshContent:
             None if normals is None else normals[used],
         )
         shapes.append(with_colors(shape, path, warnings))
-    if uncut:
-        warnings.append(UNCUT.format(uncut))
+    if crossing:
+        warnings.append(CROSSING.format(crossing))
     return MeshContent(shapes, companions.files, None, [*warnings, *companions.warnings])
 
 

@@ -131,7 +131,6 @@ class MarginalCost:
     noise_share : share of the error on queries without training that is overfitting to the noise of the
         training queries; None where it is not significant
     steps : number of training steps
-    noise_share_error : two standard errors of `noise_share`
     kept_step : step of the state that is kept, if it is not the last: later, the fit overfitted
     noise : noise variance of the training queries over the variance of their values; None where unknown
     density : training queries per texel; None where the data hold images or slices
@@ -141,7 +140,6 @@ class MarginalCost:
     doubling: float | None
     noise_share: float | None
     steps: int
-    noise_share_error: float = 0.0
     kept_step: int | None = None
     noise: float | None = None
     density: float | None = None
@@ -164,7 +162,7 @@ def marginal_cost_of(
     of its training, empty where unknown; None where the history is incomplete."""
     if not history or history[-1].get("fraction", 0.0) < 1.0:
         return None
-    share, error = _noise_share(errors, training.get("noise_variance")) or (None, 0.0)
+    share = _noise_share(errors, training.get("noise_variance"))
     last, doubling, limit = history[-1], _doubling(history), 0.0
     ratio, density = training.get("noise_ratio"), training.get("queries_per_texel")
     if ratio and density:
@@ -174,7 +172,7 @@ def marginal_cost_of(
     # Longer training reduces the rest.
     doubling = None if doubling is None else doubling ** (1.0 - limit)
     kept = kept_step(training)
-    return MarginalCost(doubling, share, int(last["step"]), error, kept, ratio, density, limit)
+    return MarginalCost(doubling, share, int(last["step"]), kept, ratio, density, limit)
 
 
 def caveat(history: list[dict[str, Any]], training: Mapping[str, Any], unexplained: Mapping[str, Any]) -> str:
@@ -240,9 +238,8 @@ def _number(x: Any) -> bool:
     return isinstance(x, int | float) and math.isfinite(x)
 
 
-def _noise_share(errors: dict[str, Any], noise: float | None) -> tuple[float, float] | None:
-    """Overfitting over the error of new queries, of either split, whichever error is known best; and
-    two standard errors.
+def _noise_share(errors: dict[str, Any], noise: float | None) -> float | None:
+    """Overfitting over the error of new queries, of either split, whichever error is known best.
 
     A fit that overfits the noise of its training queries gains an error on other queries that equals the
     variance of what it has overfitted, and its error on the training queries falls by as much. The difference
@@ -255,9 +252,6 @@ def _noise_share(errors: dict[str, Any], noise: float | None) -> tuple[float, fl
     if noise is None or training is None or new is None or new["value"] <= _SIGNIFICANT * new["error"]:
         return None
     overfit = min(0.5 * (new["value"] - training["value"]), noise)
-    # Of s = (new - training) / (2 new).
-    ratio = training["value"] / new["value"]
-    error = math.hypot(training["error"], ratio * new["error"]) / (2.0 * new["value"])
     if overfit <= _SIGNIFICANT * 0.5 * math.hypot(new["error"], training["error"]):
         return None
-    return min(1.0, float(overfit / new["value"])), _SIGNIFICANT * error
+    return min(1.0, float(overfit / new["value"]))

@@ -121,18 +121,11 @@ def normal_slopes(normal: NDArray[np.floating[Any]], smallest_z: float = _SMALLE
     return -n[..., :2] / np.maximum(n[..., 2:], smallest_z)
 
 
-def carried_share(normal: NDArray[np.float64], heights: NDArray[np.float64]) -> float:
-    """Share c ≥ 0 of the mesh's slopes `heights` (H, W, 2) that a normal map's `normal` (H, W, 2) repeats:
-    the least-squares fit of c·heights to normal."""
-    power = float(np.sum(heights**2))
-    return max(0.0, float(np.sum(heights * normal)) / power) if power > 0 else 0.0
-
-
 def residual_slopes(
     normal: NDArray[np.float32], grid: HeightGrid, mode: NormalMode = "residual"
 ) -> tuple[NDArray[np.float64], float]:
     """Slopes (h, w, 2) to add to the mesh's own at the texels of a map, and the share c ≥ 0 of the mesh's
-    slopes that the map repeats.
+    slopes that the map repeats, by least squares.
 
     Parameters
     ----------
@@ -149,7 +142,8 @@ def residual_slopes(
     if min(rows - 2 * edge[0], columns - 2 * edge[1]) < 1:
         edge = [0, 0]
     inner = (slice(edge[0], rows - edge[0]), slice(edge[1], columns - edge[1]))
-    share = carried_share(stated[inner], carried[inner])
+    power = float(np.sum(carried[inner] ** 2))
+    share = max(0.0, float(np.sum(carried[inner] * stated[inner])) / power) if power > 0 else 0.0
     taken = 1.0 if mode == "absolute" else min(share, 1.0)
     return stated - taken * carried, share
 

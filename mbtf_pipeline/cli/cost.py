@@ -28,7 +28,6 @@ def cost(
     *,
     output: Annotated[Output | None, Parameter(show_default="out/NAME-cost")] = None,
     time: Annotated[str, Parameter(metavar="DURATION")] = "10min",
-    refine: Annotated[str | None, Parameter(metavar="DURATION")] = None,
     error: ErrorOption = None,
     seed: Annotated[int | None, Parameter(converter=whole_number, show_default="the recipe's")] = None,
     dry_run: DryRun = False,
@@ -48,8 +47,6 @@ def cost(
         YAML file; its material and generator are studied.
     time
         Time budget: 90s, 2min, 1h.
-    refine
-        Additional time: repeats runs with further seeds until their 95% intervals are within ±10%.
     seed
         Root seed of all random numbers.
     """
@@ -73,7 +70,6 @@ def cost(
     if len(loaded.fit) > 1:
         console.note(f"only {DEFAULT_MODEL} is studied, with networks that suit the times; no other fit")
     seconds = asked_duration(time, "--time")
-    more = 0.0 if refine is None else asked_duration(refine, "--refine")
     folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")
     if dry_run:
         plan = plan_study(loaded, folder, seconds=seconds, seed=seed)
@@ -88,12 +84,10 @@ def cost(
             loaded,
             folder,
             seconds=seconds,
-            refine=more,
             seed=seed,
             command=command_line(
                 *("mbtf-pipeline", "cost", recipe),
                 time=time,
-                refine=refine,
                 error=error,
                 output=output,
                 seed=seed,
@@ -128,7 +122,7 @@ def cost(
     runs = [m for m in study.measurements if m.study == "run"]
     generator = len(study.measurements) - len(runs)
     counts = f"measured: {len(runs)} of complete runs, {generator} of the generator"
-    taken = f"planned for {clock(seconds + more)}, took {clock(study.description['taken'])}"
+    taken = f"planned for {clock(seconds)}, took {clock(study.description['taken'])}"
     lines = [f"{page}: {taken}", f"configurations {counts}"]
     if study.skipped:
         lines[-1] += f"; not measured for lack of time: {len(study.skipped)}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time as clocks
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -20,7 +19,6 @@ from mbtf_core.app.options import (
     QualityOption,
     Set,
     Switch,
-    Time,
     check_error,
     command_line,
 )
@@ -41,7 +39,6 @@ def run(
     *,
     output: Annotated[Output | None, Parameter(show_default="out/NAME")] = None,
     quality: QualityOption = None,
-    time: Time = None,
     error: ErrorOption = None,
     quick: Switch = False,
     dry_run: DryRun = False,
@@ -56,8 +53,7 @@ def run(
     For example: mbtf-pipeline run pipelines/quickstart.yaml
 
     A stage whose inputs have not changed is skipped; the same command again resumes an interrupted run.
-    --time is the time of everything: it takes the best preset of --quality that fits, trains for the rest,
-    and replaces the recipe's own times. --dry-run forecasts the time.
+    --dry-run forecasts the time.
 
     Parameters
     ----------
@@ -68,20 +64,11 @@ def run(
     force
         Run every stage, also those that are up to date.
     """
-    # Python itself has run for about a second.
-    began = clocks.perf_counter() - 1.0
     from mbtf_core.run.cluster import open_runner
     from mbtf_core.run.processes import Processes
     from mbtf_pipeline.collection.recipes import Collection, LibraryRecipe, load
 
-    given = {
-        "quality": quality,
-        "time": time,
-        "error": error,
-        "quick": quick,
-        "output": output,
-        "set": assignments,
-    }
+    given = {"quality": quality, "error": error, "quick": quick, "output": output, "set": assignments}
     command = command_line("mbtf-pipeline", "run", recipe, **given)
     loaded, own = load(recipe, assignments or []), assignments or []
     flags = given | {"live": live, "dry_run": dry_run}
@@ -90,7 +77,7 @@ def run(
         from mbtf_pipeline.collection.run import run_collection
 
         hint = "set times in the recipe; --quick is its small size"
-        _refuse(flags, ("quality", "time", "error", "dry_run", "live"), "a recipe of several materials", hint)
+        _refuse(flags, ("quality", "error", "dry_run", "live"), "a recipe of several materials", hint)
         folder = output or loaded.folder_of(quick)
         keep_on_interruption(f"the finished stages are kept in {folder}")
         # A crash ends one material of a library alone; the runs of a paper show their progress.
@@ -111,26 +98,17 @@ def run(
         _refuse(flags, ("quick",), "a recipe of one material", "use --quality draft")
         folder = output or loaded.folder
         from mbtf_core.config.settings import explicit_options
-        from mbtf_pipeline.recipe import is_single, preset_recipe, with_training
-        from mbtf_pipeline.run_time import RunForecaster, TimedRun, forecast_left
+        from mbtf_pipeline.forecast import RunForecaster, forecast_left
+        from mbtf_pipeline.recipe import is_single, preset_recipe, with_error
 
         # The file may be another one when the run has ended.
         single = is_single(explicit_options(recipe, own)["fit"])
-        if time is None:
-            loaded, generated = preset_recipe(recipe, quality, own), None
-            draft = partial(preset_recipe, recipe, "draft", own)
-            if not dry_run and (expected := forecast_left(loaded, folder, draft)) is not None:
-                console.note(expected)
-        else:
-            from mbtf_core.units import asked_duration
-
-            seconds = asked_duration(time, "--time")
-            timed = TimedRun(
-                recipe, seconds, folder, command, console.note, quality, own, began, dry_run=dry_run
-            )
-            loaded, generated, quality = timed.recipe, timed.generated, timed.split.quality
+        loaded = preset_recipe(recipe, quality, own)
+        draft = partial(preset_recipe, recipe, "draft", own)
+        if not dry_run and (expected := forecast_left(loaded, folder, draft)) is not None:
+            console.note(expected)
         if error is not None:
-            loaded = with_training(loaded, error=error)
+            loaded = with_error(loaded, error)
         if dry_run:
             forecaster = RunForecaster(loaded)
             forecaster.job.announce_briefly()
@@ -148,7 +126,6 @@ def run(
                 force=force,
                 command=command,
                 console=console,
-                generated=generated,
                 live=page,
                 runner=runner,
             )
@@ -183,18 +160,14 @@ def _next_command(
 ) -> str | None:
     """The command of a run, `given` its own options, with those that its fits, by name, need; None where they
     need none. `single`: the recipe has no name for its fit."""
-    from mbtf_core.units import asked_duration, format_duration
-
-    own, more, changes = given["set"] or [], dict(given), dict[str, str]()
+    own, changes = given["set"] or [], dict[str, str]()
     for name, needed in options.items():
         changes |= {k.replace("fit", "fit" if single else f"fit.{name}", 1): v for k, v in needed.items()}
-    if given["time"] and any(key.endswith(".training.time") for key in changes):
-        # The time of everything sets those of the fits.
-        more["time"] = format_duration(2 * asked_duration(given["time"], "--time"))
-        changes = {key: value for key, value in changes.items() if not key.endswith(".training.time")}
+    if not changes:
+        return None
     kept = [text for text in own if text.partition("=")[0].strip() not in changes]
-    more["set"] = [*kept, *(f"{key}={value}" for key, value in changes.items())]
-    return command_line("mbtf-pipeline", "run", file, **more) if more != {**given, "set": own} else None
+    more = [*kept, *(f"{key}={value}" for key, value in changes.items())]
+    return command_line("mbtf-pipeline", "run", file, **{**given, "set": more})
 
 
 def _report(

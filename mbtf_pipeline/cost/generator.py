@@ -31,7 +31,7 @@ from mbtf_gen.planning.run_plan import allocate, plan_effects
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Stream
 from mbtf_gen.tile.protocol import Tile
-from mbtf_pipeline.cost.measurement import HALF_WIDTH, NORMAL, Conditions, Configuration, Measurement
+from mbtf_pipeline.cost.measurement import Conditions, Configuration, Measurement
 
 PATHS = (2, 4, 8, 16, 32, 64, 128)
 TARGETS = ("40%", "20%", "10%")
@@ -48,6 +48,8 @@ _MOST_BIAS_BATCHES = 16
 _BATCH_PATHS = 1 << 19
 _FEWEST_BATCHES = 8
 _FEWEST_PATHS = 2.0
+# Relative half-width of a 95% interval to aim at, and that half-width over the standard error.
+_HALF_WIDTH, _NORMAL = 0.1, 1.96
 # Squared biases below the square of this are negligible.
 _NEGLIGIBLE = 0.005
 # Relative standard deviation of the values below which a fit has nothing to learn.
@@ -177,7 +179,7 @@ class GeneratorBenchmark:
             a, b = _halves(job, estimator, queries, BIAS_SPP, _FIRST_REFERENCE + len(squares))
             squares.append(((a - r) * (b - s)).mean(axis=1) / reference.mean**2)
             square = mean_estimate(np.concatenate(squares))
-            enough = NORMAL * square.error <= max(2 * HALF_WIDTH * square.value, _NEGLIGIBLE**2)
+            enough = _NORMAL * square.error <= max(2 * _HALF_WIDTH * square.value, _NEGLIGIBLE**2)
             late = time.perf_counter() - start > seconds or len(squares) == _MOST_BIAS_BATCHES
             if enough or late:
                 return square
@@ -210,7 +212,7 @@ class GeneratorBenchmark:
             squares.append(((found.value_a.astype(np.float64) - found.value_b) ** 2 / 4.0).mean(axis=1))
             variance = mean_estimate(np.concatenate(squares)).scaled(1.0 / mean**2)
             # The 95% interval of its root.
-            narrow = NORMAL * variance.error <= 2 * HALF_WIDTH * variance.value
+            narrow = _NORMAL * variance.error <= 2 * _HALF_WIDTH * variance.value
             late = time.perf_counter() - began > seconds
             if len(squares) >= _FEWEST_BATCHES and (narrow or late):
                 # The first batch may compile kernels.

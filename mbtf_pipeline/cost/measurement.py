@@ -26,9 +26,6 @@ SCHEMA = 11
 FOLDER, CONFIG_NAME, WORK = "measurements", "generate.yaml", ".work"
 # About as many configurations of the generator share its time.
 _CONFIGURATIONS = 35
-# Relative half-width of a 95% interval that a study aims at, and that half-width over the standard error.
-HALF_WIDTH = 0.1
-NORMAL = 1.96
 ESTIMATES = ("seconds", "error", "bias", "noise")
 # Relative standard deviation of a run over seeds before any run is repeated, and the degrees of freedom that
 # it counts for: studies of four materials found 1.5 to 6% (docs/results/cost.md).

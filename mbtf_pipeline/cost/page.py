@@ -71,7 +71,7 @@ def _series(
     name: str,
     found: Sequence[Measurement],
     part: str = "error",
-    label: Callable[[Measurement], str] = attrgetter("name"),
+    label: Callable[[Measurement], str] = lambda m: "",
     **options: Any,
 ) -> Series:
     """A part of the error over time."""
@@ -102,24 +102,16 @@ def _front_section(runs: Sequence[Measurement], evidence: Evidence, png: Path) -
         figure = {"svg": "", "caption": "One complete run was measured; a plot and a Pareto front take two."}
         return {"figure": figure, "table": table}
 
-    # Of runs whose errors round to the same, only the fastest has a label.
-    named = {f"{m.error.value:.2g}": m for m in reversed(front)}
-
-    def name(m: Measurement) -> str:
-        error = f"{m.error.value:.2g}"
-        return f"{error} in {m.seconds.value:.0f} s" if named.get(error) is m else ""
-
     axes = "seconds in total, from height map to material", "unexplained variance of test queries"
-    caption = "Labels: error and total time of the runs on the Pareto front."
     bars = "their time: scatter, and what other work may have added"
-    series = [_series("complete runs", runs, label=name, style="points", x_error_name=bars)]
+    series = [_series("complete runs", runs, style="points", x_error_name=bars)]
     if evidence.curve is not None:
         x = np.geomspace(evidence.runs[-1].seconds.value, evidence.farthest, 12).tolist()
         found = [one for seconds in x if (one := evidence.error_after(seconds)) is not None]
         bounds = [one.value - one.low for one in found], [one.high - one.value for one in found]
         series.append(Series("forecast, 95% interval", x, [one.value for one in found], bounds))
     stepped = [(m.seconds.value, m.error.value) for m in front] if len(front) > 1 else []
-    figure = _figure(series, *axes, png, caption, front=stepped)
+    figure = _figure(series, *axes, png, front=stepped)
     return {"figure": figure, "table": table}
 
 
@@ -128,21 +120,25 @@ def _generator_section(found: Sequence[Measurement], png: Path) -> dict[str, Any
     found = sorted(found, key=lambda m: (m.series, m.seconds.value))
     biased = [m for m in found if m.bias and is_significant(m.bias)]
     unbiased = [m for m in found if m.bias and m not in biased]
-    caption = ""
+    caption = "Numbers are those of the table below."
+
+    def number(m: Measurement) -> str:
+        return str(found.index(m) + 1)
+
     if biased or unbiased:
-        series = [_series("bias", biased, "bias", style="points")]
-        label = {"label": lambda m: m.name if m in unbiased else ""}
-        series.append(_series("noise", found, "noise", style="points", hollow=True, **label))
+        series = [_series("bias", biased, "bias", number, style="points")]
+        series.append(_series("noise", found, "noise", number, style="points", hollow=True))
     else:
         names = dict.fromkeys(m.series for m in found)
-        series = [_series(n, [m for m in found if m.series == n], style="joined") for n in names]
+        lines = ((name, [m for m in found if m.series == name]) for name in names)
+        series = [_series(*line, label=number, style="joined") for line in lines]
     if unbiased:
         limit = 100 * max(2 * max(m.bias.error, m.bias.value) for m in unbiased if m.bias)
         most = f"at most {limit:.2g}%" if limit < 100 else "though it may exceed 100%"
-        caption = f"Labels at the noise: the bias is not significant, {most} of the mean value."
+        caption += f" A bias that is not shown is not significant, {most} of the mean value."
     return {
         "figure": _figure(series, "seconds per million queries", _NOISE_AXIS, png, caption),
-        "table": _table(_GENERATOR, found).for_page(),
+        "table": _table([Column("number", "", number), *_GENERATOR], found).for_page(),
     }
 
 

@@ -34,13 +34,10 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import generate
 from mbtf_gen.job import Job
 from mbtf_pipeline.cost.measurement import Conditions, Configuration, Measurement
-from mbtf_pipeline.run_time import round_down
 
 if TYPE_CHECKING:
     from mbtf_fit.data.queries import ShardQueries
 
-# Most seeds of a run.
-MOST_SEEDS = 12
 # Shares of a study's time that the generator and the runs get. The rest is left for start-up, the test set,
 # loading and evaluation.
 GENERATOR, RUNS = 0.1, 0.7
@@ -161,7 +158,7 @@ def planned_runs(seconds: float, spp: int, path_seconds: float, step_seconds: fl
         if runs and (total > left or (1 - share) * total < FEWEST_STEPS * step_seconds):
             continue
         left -= total
-        queries = round_down(max(_FEWEST_QUERIES, share * total / (spp * path_seconds)))
+        queries = _round_down(max(_FEWEST_QUERIES, share * total / (spp * path_seconds)))
         training = (1 - share) * total
         fit = {
             "model": DEFAULT_MODEL,
@@ -219,3 +216,9 @@ def _evaluation_seconds(material: Any, test: ShardQueries) -> float:
     timer = time.perf_counter
     seconds = min(timeit.repeat(lambda: material.evaluate(*arrays), timer=timer, number=1, repeat=_TIMED))
     return seconds * PIXELS / _TIMED_QUERIES
+
+
+def _round_down(count: float) -> int:
+    """A number of queries with two significant digits."""
+    digits = 10 ** max(0, len(str(int(count))) - 2)
+    return max(1, int(count / digits) * digits)

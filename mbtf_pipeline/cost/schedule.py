@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import takewhile
+from itertools import count, takewhile
 
 from mbtf_core.errors import PartialError
 from mbtf_core.run.runner import Runner
@@ -15,20 +14,16 @@ from mbtf_core.run.task import Item
 from mbtf_core.units import clock
 from mbtf_pipeline.cost.generator import benchmark_of, generator_configurations, path_seconds
 from mbtf_pipeline.cost.measurement import (
-    HALF_WIDTH,
-    NORMAL,
     Conditions,
     Configuration,
     Measurement,
     MeasurementFolder,
     measure,
-    seed_deviation,
 )
 from mbtf_pipeline.cost.runs import (
     FEWEST_TOTALS,
     GENERATOR,
     LEAST_SECONDS,
-    MOST_SEEDS,
     SHORTEST,
     SLOW_SERIES,
     TEST,
@@ -198,29 +193,19 @@ class Measurements:
 
     def group(self, run: Run) -> list[Measurement]:
         """The measurements of a run with the first seeds, without gaps."""
-        labels = (replace(run, seed=seed).label for seed in range(MOST_SEEDS))
+        labels = (replace(run, seed=seed).label for seed in count())
         return [self.found[label] for label in takewhile(self.found.__contains__, labels)]
 
-    def measure_runs(self, runs: Sequence[Run], fits: Callable[[Run], bool], seeds: int = 0) -> None:
-        """Measure runs in their order, then, up to so many seeds, further seeds of those whose error bar over
-        seeds is too wide, while they fit into the remaining time."""
+    def measure_runs(self, runs: Sequence[Run], fits: Callable[[Run], bool]) -> None:
+        """Measure runs in their order, while they fit into the remaining time."""
 
-        def missing(order: Iterable[Run], wanted: Callable[[Run], bool]) -> Iterator[Run]:
-            for run in order:
+        def missing() -> Iterator[Run]:
+            for run in runs:
                 failed = {run.label, replace(run, seed=0).label} & self.failed.keys()
-                if not failed and not self.recall(run) and wanted(run) and fits(run):
+                if not failed and not self.recall(run) and fits(run):
                     yield run
 
-        self.measure(missing(runs, lambda run: True), independent=True)
-        first = [run for run in runs if run.seed == 0]
-        for seed in range(1, MOST_SEEDS):
-            deviation = seed_deviation(self.group(run) for run in first)
-
-            def wide(run: Run, deviation: float = deviation.value) -> bool:
-                own = len(self.group(run))
-                return own == run.seed < seeds and NORMAL * deviation / math.sqrt(own) > HALF_WIDTH
-
-            self.measure(missing([replace(run, seed=seed) for run in first], wide), independent=True)
+        self.measure(missing(), independent=True)
 
 
 def generator_seconds(seconds: float) -> float:

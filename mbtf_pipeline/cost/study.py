@@ -37,7 +37,7 @@ from mbtf_pipeline.cost.measurement import (
     combined,
     seed_deviation,
 )
-from mbtf_pipeline.cost.runs import GENERATOR, MOST_SEEDS, Run, disk_bytes, test_set
+from mbtf_pipeline.cost.runs import GENERATOR, Run, disk_bytes, test_set
 from mbtf_pipeline.cost.schedule import COMPILING, RESUMES, Measurements, generator_seconds
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.stages import machine
@@ -126,7 +126,6 @@ def run_study(
     folder: Path,
     *,
     seconds: float,
-    refine: float = 0.0,
     seed: int | None = None,
     command: str = "",
     progress: Callable[[float, str], None] = lambda share, note: None,
@@ -138,7 +137,7 @@ def run_study(
 
     Parameters
     ----------
-    seconds, refine : time of the study, and what is added for repeating runs with wide error bars
+    seconds : time of the study
     seed : of queries, paths and initial weights; the recipe's by default
     command : for the page
     progress, announce : called with (share of the time spent, note), and with lines for the user
@@ -156,7 +155,7 @@ def run_study(
         return time.perf_counter() - start
 
     def note(text: str) -> None:
-        progress(min(1.0, spent() / (seconds + refine)), text)
+        progress(min(1.0, spent() / seconds), text)
 
     job = Job.load(study_config(recipe.generate, seed))
     config = job.config
@@ -172,7 +171,7 @@ def run_study(
         description = {
             "name": recipe.name,
             "command": command,
-            "time": seconds + refine,
+            "time": seconds,
             "seed": config.seed,
             "material": config.material,
             "date": time.strftime("%Y-%m-%d"),
@@ -199,15 +198,15 @@ def run_study(
             size = disk_bytes(runs) * runner.workers
             check_space(folder, size, "give a shorter --time, or choose another folder with -o")
             _, expected = measurements.fitting(runs, spent(), seconds)
-            announce(expectation((expected if runner.here else seconds) + refine, size))
+            announce(expectation(expected if runner.here else seconds, size))
 
             def fits(run: Run) -> bool:
-                return measurements.fits(run, seconds + (refine if run.seed else 0.0) - spent())
+                return measurements.fits(run, seconds - spent())
 
             # The first run measures how long runs and training steps take here.
             measurements.measure_runs(runs[:1], fits)
             runs = measurements.plan_runs(seconds, spp)
-            measurements.measure_runs(runs, fits, MOST_SEEDS if refine else 0)
+            measurements.measure_runs(runs, fits)
             description["taken"] = spent()
             STUDY.write(folder, description)
         finally:

@@ -8,8 +8,7 @@ from __future__ import annotations
 import base64
 import io
 import math
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import quote
@@ -27,7 +26,6 @@ from mbtf_core.color import (
     to_display,
     white_of,
 )
-from mbtf_core.images.resample import shrink
 from mbtf_core.stats import local_error
 from mbtf_core.units import tiles_text
 from mbtf_pipeline.compare.image_files import read_halves, read_map, read_picture
@@ -48,10 +46,8 @@ from mbtf_pipeline.tables import (
 U8 = NDArray[np.uint8]
 F32 = NDArray[np.float32]
 Pixels = NDArray[np.floating]
-# A page's images by name, each a function of the reduction.
-Gallery = dict[str, Callable[[int], str]]
-# Side of the blocks of pixels that a page's images are averaged over, until it is small enough.
-REDUCTIONS = (1, 2, 4, 8, 16)
+# URIs of a page's images by name.
+Gallery = dict[str, str]
 _JPEG_QUALITY = 86
 
 
@@ -88,15 +84,9 @@ def data_uri(display: U8, kind: Literal["png", "jpeg"] = "png", colors: Palette 
     return f"data:image/{kind};base64,{base64.b64encode(stream.getvalue()).decode()}"
 
 
-def linear_uri(picture: F32, exposure: float, reduction: int = 1) -> str:
-    """``data:`` URI of a linear image (rows, columns, 3) in 1/sr at an exposure in EV, as PNG of averages of
-    `reduction` × `reduction` pixels."""
-    return data_uri(to_display(shrink(picture, reduction), exposure))
-
-
-def map_uri(values: Pixels, name: Palette, reduction: int = 1) -> str:
-    """``data:`` URI of a map (rows, columns) as PNG in the colors of a palette, likewise."""
-    return data_uri(indices(shrink(values, reduction), name), colors=name)
+def map_uri(values: Pixels, name: Palette) -> str:
+    """``data:`` URI of a map (rows, columns) as PNG in the colors of a palette."""
+    return data_uri(indices(values, name), colors=name)
 
 
 def file_uri(path: Path, most: int | None = None) -> str:
@@ -145,7 +135,7 @@ def picture_section(
         references = [picture["references"][kind]["file"] for kind in comparison["kinds"]]
         fits = [picture["fits"][fit]["file"] for fit in comparison["fits"]]
         pictures = {file: read_picture(folder / file) for file in (*references, *fits)}
-        gallery |= {file: partial(linear_uri, value, exposure) for file, value in pictures.items()}
+        gallery |= {file: data_uri(to_display(value, exposure)) for file, value in pictures.items()}
         a, b = read_halves(folder / references[0])
         mean = 0.5 * (a.astype(np.float64) + b)
         for fit, file in zip(comparison["fits"], fits, strict=True):
@@ -187,7 +177,7 @@ def scaled_maps(
         clipped = {image: share for image, share in shares.items() if share > _CLIPPED}
         title, unit, factor = _MAPS[kind]
         bars[kind] = color_bar(kind, title, scale, unit, factor, clipped=bool(clipped))
-        images |= {image: partial(map_uri, values / scale, kind) for image, values in found.items()}
+        images |= {image: map_uri(values / scale, kind) for image, values in found.items()}
         beyond |= clipped
     return bars, images, beyond
 
@@ -299,7 +289,7 @@ def _offset_row(
     cells = []
     for number, (record, values, median) in enumerate(zip(records, maps, medians, strict=True)):
         name = f"offset-{fit or 'traced'}-{number}"
-        gallery[name] = partial(map_uri, values / scale, "signed")
+        gallery[name] = map_uri(values / scale, "signed")
         view = f"view {direction(record['view'])}"
         lines = [view, signed(f"median {median:.2g} tile widths")]
         if fit is not None and (found := record["fits"][fit]["correlation"]) is not None:

@@ -19,7 +19,7 @@ from mbtf_core.units import tiles_text
 from mbtf_pipeline.compare.compare import COMPARISON_NAME, COMPARISON_SCHEMA
 from mbtf_pipeline.compare.image_files import read_picture
 from mbtf_pipeline.recipe import RECIPE_NAME, Recipe
-from mbtf_pipeline.report.images import REDUCTIONS, Gallery, offset_section, picture_section
+from mbtf_pipeline.report.images import Gallery, offset_section, picture_section
 from mbtf_pipeline.report.plots import ERROR_BAR_NOTE
 from mbtf_pipeline.report.sections import (
     error_context,
@@ -55,7 +55,7 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
     folder : Path
         Folder of the run.
     recipe : Recipe
-        Its title, exposure and size limit are used.
+        Its title and exposure are used.
     stages : sequence of str
         Names of the stages whose times are shown.
 
@@ -93,23 +93,12 @@ def write_report(folder: Path, recipe: Recipe, stages: Sequence[str]) -> None:
         "time_tables": time_tables(folder, stages, comparison),
         "exposure": describe_exposure(exposure),
     }
-    # The first page that is small enough, or the smallest.
-    for reduction in REDUCTIONS:
-        images = {name: image(reduction) for name, image in gallery.items()}
-        # The page shows all other images in its sheet.
-        differences = {name: uri for name, uri in images.items() if name.endswith("-signed")}
-        data = {"fits": comparison["fits"], "scenes": shown["scenes"], "differences": differences}
-        html = render(
-            "report.html",
-            **context,
-            images=images,
-            reduction=reduction,
-            # Valid within a <script> element.
-            viewer=json.dumps(data, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c"),
-        )
-        if len(html.encode()) <= recipe.report.max_megabytes * 1e6:
-            break
-    write_document(folder / REPORT, html)
+    # The page shows all other images in its sheet.
+    differences = {name: uri for name, uri in gallery.items() if name.endswith("-signed")}
+    data = {"fits": comparison["fits"], "scenes": shown["scenes"], "differences": differences}
+    # Valid within a <script> element.
+    viewer = json.dumps(data, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
+    write_document(folder / REPORT, render("report.html", **context, images=gallery, viewer=viewer))
 
 
 def write_viewer(folder: Path, title: str, comparison: Mapping[str, Any]) -> None:

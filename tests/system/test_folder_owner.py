@@ -27,7 +27,6 @@ COMMANDS = [
     "mbtf-gen reference heights.npy -o out",
     "mbtf-gen reference heights.npy -o out --overwrite",
     "mbtf-pipeline run recipe.yaml -o out",
-    "mbtf-pipeline run recipe.yaml -o out --time 1min",
     "mbtf-pipeline cost recipe.yaml -o out",
 ]
 

@@ -104,13 +104,11 @@ class YarnPattern:
     ----------
     aspect : height of the period over its width
     radius : radius of the yarns
-    width : width of the period in meters
     yarns : tuple of YarnLoop
     """
 
     aspect: float
     radius: float
-    width: float
     yarns: tuple[YarnLoop, ...]
 
 
@@ -149,7 +147,7 @@ def read_pattern(path: Path) -> YarnPattern:
         if not (np.linalg.norm(following - points, axis=1) > 0).all():
             raise InputError("two vertices of a yarn are at the same place", where=path)
         yarns.append(YarnLoop(points / px, shift))
-    return YarnPattern(py / px, radius / px, px, tuple(yarns))
+    return YarnPattern(py / px, radius / px, tuple(yarns))
 
 
 def _sections(stream: BinaryIO, path: Path) -> dict[str, list[list[float]]]:

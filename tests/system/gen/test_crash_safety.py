@@ -306,16 +306,10 @@ def test_a_full_disk_ends_in_one_message_and_more_room_repairs_it(suffix: str, t
     assert not list((tmp_path / "out").glob(".*"))
 
 
-@pytest.mark.parametrize(
-    "amounts",
-    [
-        "--kills 3 --flips 60 --repairs 2 --rendered 0",
-        pytest.param("--kills 150 --flips 3000 --repairs 60 --rendered 6", marks=pytest.mark.slow),
-    ],
-)
-def test_random_kills_lose_nothing_and_corruption_is_found(amounts: str, run_python: RunPython) -> None:
-    script = ROOT / "benchmarks/crash_safety.py"
-    done = run_python(str(script), *amounts.split())
+@pytest.mark.slow
+def test_random_kills_lose_nothing_and_corruption_is_found(run_python: RunPython) -> None:
+    amounts = "--kills 150 --flips 3000 --repairs 60 --rendered 6"
+    done = run_python(str(ROOT / "benchmarks/crash_safety.py"), *amounts.split())
     assert done.returncode == 0, done.stdout + done.stderr
     figures = json.loads(done.stdout.splitlines()[-1])["figures"]
     assert figures["lost or not found"] == 0

@@ -29,15 +29,12 @@ TIME, QUERIES = {"fit.training.time": "2min"}, {"generate.queries.train": "800/t
             TIME,
             "--quality draft --set compare.size=64 --set fit.relief.training.time=2min",
         ),
-        # A time of everything sets those of the fits.
-        (False, {"time": "4min"}, TIME | QUERIES, "--time 8min --set generate.queries.train=800/texel"),
-        (False, {"time": "4min"}, QUERIES, "--time 4min --set generate.queries.train=800/texel"),
         (False, {}, {}, None),
     ],
 )
 def test_the_next_command_sets_keys_of_the_recipe(
     single: bool, options: dict[str, Any], changes: dict[str, str], words: str | None
 ) -> None:
-    given = {"quality": None, "time": None, "set": None, **options}
+    given = {"quality": None, "set": None, **options}
     found = _next_command(Path("r.yaml"), single, given, {"relief": changes, "quick": {}})
     assert found == (None if words is None else f"mbtf-pipeline run r.yaml {words}")

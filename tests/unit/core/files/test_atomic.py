@@ -7,10 +7,7 @@ import hashlib
 import itertools
 import json
 import os
-import signal
 import stat
-import subprocess
-import sys
 import threading
 from pathlib import Path
 
@@ -22,31 +19,6 @@ from mbtf_core.files import atomic
 
 def no_leftovers(folder: Path) -> bool:
     return not any(p.name.endswith(".tmp") for p in folder.iterdir())
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
-@pytest.mark.parametrize("moment", ["write", "fsync", "replace"])
-def test_a_kill_leaves_the_old_file(moment: str, tmp_path: Path) -> None:
-    path = tmp_path / "a.bin"
-    path.write_bytes(b"old")
-    code = f"""
-import os, signal
-from pathlib import Path
-from mbtf_core.files import atomic
-def die(*arguments):
-    os.kill(os.getpid(), signal.SIGKILL)
-if {moment!r} != "write":
-    setattr(os, {moment!r}, die)
-def write(stream):
-    stream.write(b"x" * 100000)
-    if {moment!r} == "write":
-        stream.flush()
-        die()
-atomic.write_file(Path({str(path)!r}), write)
-"""
-    done = subprocess.run([sys.executable, "-c", code], check=False)
-    assert done.returncode == -signal.SIGKILL
-    assert path.read_bytes() == b"old"
 
 
 @pytest.mark.parametrize("through_name", [False, True])

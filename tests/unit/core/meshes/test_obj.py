@@ -108,16 +108,16 @@ def test_polygons_are_cut_exactly(turned: bool) -> None:
     ]
     areas = [0.5, 1, 1.7, 3, 8, 10 * 0.3 * np.sin(np.pi / 10)]
     points = np.concatenate([np.pad(np.array(p, float), ((0, 0), (0, 1))) @ rotation.T + 5 for p in polygons])
-    triangles, polygon, uncut = triangulate(points, np.array([len(p) for p in polygons]))
-    assert uncut == 0
+    triangles, polygon, crossing = triangulate(points, np.array([len(p) for p in polygons]))
+    assert crossing == 0
     corner = points[triangles]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]) / 2
     # Unsigned areas add up only if no triangles overlap; all turn the same way.
     found = np.bincount(polygon, np.linalg.norm(normal, axis=1))
     np.testing.assert_allclose(found, areas, rtol=1e-9)
     assert (normal @ rotation[:, 2] > -1e-12).all()
-    crossing = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 0], [0, 2, 0], [-1, 1, 0]], float)
-    assert triangulate(crossing, np.array([5]))[2] == 1
+    bent = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 0], [0, 2, 0], [-1, 1, 0]], float)
+    assert triangulate(bent, np.array([5]))[2] == 1
 
 
 def test_trimesh_and_mitsuba_read_the_same(tmp_path: Path) -> None:

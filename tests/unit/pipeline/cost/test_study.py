@@ -28,7 +28,7 @@ from mbtf_pipeline.cost.measurement import (
     Measurement,
     MeasurementFolder,
 )
-from mbtf_pipeline.cost.runs import MOST_SEEDS, Run
+from mbtf_pipeline.cost.runs import Run
 from mbtf_pipeline.cost.schedule import Measurements
 from mbtf_pipeline.recipe import load_recipe
 
@@ -84,11 +84,11 @@ def test_workers_measure_the_runs_of_one_process(monkeypatch: pytest.MonkeyPatch
     groups = []
     for runner in (Runner(), Workers()):
         found = Measurements(conditions(), MemoryStore(), runner)  # type: ignore[arg-type]
-        found.measure_runs(planned, lambda run: True, MOST_SEEDS)
+        found.measure_runs(planned, lambda run: True)
         groups.append([found.group(run) for run in runs])
         assert found.failed[runs[2].label] == "training diverged at step 7"
     assert groups[0] == groups[1]
-    assert [len(group) for group in groups[0]] == [MOST_SEEDS, MOST_SEEDS, 0]
+    assert [len(group) for group in groups[0]] == [2, 2, 0]
 
 
 RUNS = [run(3000, "long", 7200.0), run(2000, "short", 60.0), run(1000, "m", 40.0)]
@@ -137,11 +137,6 @@ def test_a_study_keeps_its_time_and_resumes(fake: FakeRuns, tmp_path: Path) -> N
     second, runs = measured(seconds=190.0)
     assert [(r.name, r.seed) for r in runs] == [("m", 1)]
     assert second.measurements[2].error.value == first.measurements[2].error.value
-    # Refining takes its own time, for further seeds.
-    _, runs = measured(seconds=190.0, refine=3600.0)
-    assert {r.seed for r in runs} >= {2}
-    assert all(r.name != "long" for r in runs)
-    assert sum(r.planned_seconds(0.0) for r in runs) <= 3790.0
 
 
 def test_a_full_disk_keeps_what_is_measured(

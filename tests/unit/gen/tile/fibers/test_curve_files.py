@@ -57,7 +57,7 @@ def test_a_pattern_has_the_yarns_of_its_edges(tmp_path: Path) -> None:
     path = tmp_path / "a.pyp"
     path.write_text(PYP)
     pattern = read_pattern(path)
-    assert (pattern.aspect, pattern.radius, pattern.width) == pytest.approx((0.5, 0.075, 0.004))
+    assert (pattern.aspect, pattern.radius) == pytest.approx((0.5, 0.075))
     (yarn,) = pattern.yarns
     assert yarn.shift.tolist() == [1, 0]
     assert yarn.points[:, 0] == pytest.approx([0.125, 0.375, 0.625, 0.875])
