@@ -106,7 +106,7 @@ def read_mesh(spec: MeshFile, folder: Path) -> MeshTile:
         digests={
             **{role: file_sha256(file) for role, file in files.items()},
             # The number rises when the same file is read as another material.
-            "settings": data_sha256([2, spec.model_dump(mode="json", exclude={"mesh"})]),
+            "settings": data_sha256([3, spec.model_dump(mode="json", exclude={"mesh"})]),
         },
         warnings=(
             *warnings,
