@@ -25,6 +25,8 @@ class Cloth(Relief):
         **Relief.defaults,
         "training": {
             **Relief.defaults["training"],
+            # Noise of fibers has no such bright paths as that of glossy surfaces, which ask for more.
+            "noise_regularization": 0.3,
             # The relative loss alone leaves the grazing highlights of fibers at half their value.
             "losses": [
                 {"kind": "relative"},
