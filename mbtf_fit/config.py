@@ -136,11 +136,11 @@ class FitConfig(Settings):
 
     def fields(self) -> dict[str, Any]:
         """Options that determine the fit, as plain data: all but device and memory, and without those of
-        shared networks and an error to stop at where they are not used."""
+        shared networks, residual levels and an error to stop at where they are not used."""
         found = self.model_dump(mode="json", exclude={"device", "data"})
         if self.decoder is None:
             del found["decoder"]
-        for name in ("shared_decoder", "error"):
+        for name in ("shared_decoder", "residual_levels", "error"):
             if not found["training"][name]:
                 del found["training"][name]
         return found

@@ -51,14 +51,20 @@ def interpolation(size: int, coarser: int) -> Taps:
     return Taps(index.astype(np.int32), np.stack([1 - right, right], -1))
 
 
+@cache
+def _on(device: torch.device, size: int, coarser: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The two texels of each interpolation, and the weight of the second one."""
+    taps = interpolation(size, coarser)
+    left, right = (torch.from_numpy(taps.index[:, k].copy()).to(device) for k in (0, 1))
+    return left, right, torch.from_numpy(taps.weight[:, 1].copy()).to(device)
+
+
 def enlarged(texture: Tensor, shape: tuple[int, int]) -> Tensor:
     """A periodic texture (rows, columns, channels) at another resolution, interpolated; differentiable."""
     for axis, size in enumerate(shape):
-        taps = interpolation(size, texture.shape[axis])
-        index = torch.from_numpy(taps.index).to(texture.device)
-        right = torch.from_numpy(taps.weight[:, 1]).to(texture).view(-1, *[1] * (2 - axis))
-        left, far = (texture.index_select(axis, index[:, k]) for k in (0, 1))
-        texture = torch.lerp(left, far, right)
+        left, right, weight = _on(texture.device, size, texture.shape[axis])
+        ends = (texture.index_select(axis, index) for index in (left, right))
+        texture = torch.lerp(*ends, weight.to(texture.dtype).view(-1, *[1] * (2 - axis)))
     return texture
 
 

@@ -113,6 +113,7 @@ class FeatureTextures(nn.Module):
     ----------
     texels : (texels, channels) parameter, all levels one after the other
     residual : whether levels are sums over the coarser ones; see :meth:`make_residual`
+    settled : whether the parameter is what lookups read; see :meth:`settle`
     """
 
     def __init__(
@@ -122,7 +123,7 @@ class FeatureTextures(nn.Module):
         self.moves_lookups = moves_lookups
         self.packing = Packing.of(lattice, levels)
         self.texels = nn.Parameter(torch.zeros(self.packing.texels, channels))
-        self.residual = False
+        self.residual = self.settled = False
         self._table: Tensor | None = None
 
     @property
@@ -138,9 +139,18 @@ class FeatureTextures(nn.Module):
     def make_residual(self) -> None:
         """From now on, let the parameter hold what each level adds to the next coarser one; lookups read the
         same (:mod:`mbtf_fit.pytorch.residuals`)."""
+        self.read(self.texels.detach().clone())
         with torch.no_grad():
             self.texels.copy_(residuals_of(self.texels, self.packing))
         self.residual = True
+
+    def settle(self, sigma: float) -> None:
+        """After training, make what lookups read the parameter, blurred by `sigma`: neither blur nor sums
+        follow."""
+        with torch.no_grad():
+            self.texels.copy_(self.blurred(sigma))
+        self.read(None)
+        self.residual, self.settled = False, True
 
     def blurred(self, sigma: float) -> Tensor:
         """What lookups read: the texels, blurred by a Gaussian of `sigma` texels of the finest level.
@@ -149,7 +159,7 @@ class FeatureTextures(nn.Module):
         code).
         """
         table: Tensor = self.texels
-        if sigma > 0:
+        if sigma > 0 and not self.settled:
             starts, shapes = self.packing.starts, self.packing.shapes
             finest = shapes[-1][1]
             parts = []
@@ -166,12 +176,9 @@ class FeatureTextures(nn.Module):
         if first <= 0:
             return
         with torch.no_grad():
-            table = summed(self.texels, self.packing) if self.residual else self.texels
-            finer = table[starts[first] : starts[first + 1]].t().view(1, -1, *shapes[first])
+            finer = self.texels[starts[first] : starts[first + 1]].t().view(1, -1, *shapes[first])
             averages = (nn.functional.adaptive_avg_pool2d(finer, shape)[0] for shape in shapes[:first])
-            table[: starts[first]] = torch.cat([a.flatten(1).t() for a in averages])
-            if self.residual:
-                self.texels.copy_(residuals_of(table, self.packing))
+            self.texels[: starts[first]] = torch.cat([a.flatten(1).t() for a in averages])
 
     def export(self) -> dict[str, Tensor]:
         """Current table by level, ``0`` the coarsest: (rows, columns, channels) each."""
@@ -183,7 +190,7 @@ class FeatureTextures(nn.Module):
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
         """Load tensors of :meth:`export`, to be read without blur; other entries are ignored."""
-        self._table, self.residual = None, False
+        self._table, self.residual, self.settled = None, False, False
         with torch.no_grad():
             parts = [tensors[str(s)].flatten(0, 1) for s in range(len(self.packing.shapes))]
             self.texels.copy_(torch.cat(parts))

@@ -317,10 +317,15 @@ class Trainer:
         of the next finer one. Measured BTFs have one footprint: their coarser levels would keep their initial
         noise. Levels that are read beside those of the footprint are trained, too."""
         read = min((o.finer for o in self.model.operations if isinstance(o, Lookup)), default=0.0)
-        self.model.textures()[0].average_coarser(math.floor(coarsest + _SAME_LEVEL + read))
+        pyramid, first = self.model.textures()[0], math.floor(coarsest + _SAME_LEVEL + read)
+        if pyramid.residual and first > 0:
+            # A blur and sums would mix the averages with finer levels.
+            pyramid.settle(self._sigmas()[0])
+        pyramid.average_coarser(first)
 
     def coverage(self) -> dict[int, float]:
-        """Level → fraction of the pyramid's texels that have received gradients."""
+        """Level → fraction of the pyramid's texels that have received gradients; those of residual levels also
+        come from finer ones."""
         pyramid = self.model.textures()[0]
         if not self.hooks.trained()[0]:
             return dict.fromkeys(range(self.model.lattice.finest + 1), 1.0)

@@ -75,7 +75,9 @@ def test_headers_are_those_of_direct3d(tmp_path: Path) -> None:
     assert run(app, [*line, "-o", str(tmp_path / "out")]) == 0
     weights = Material.load(tmp_path / "out").model.weights()
     # DXGI_FORMAT_BC5_UNORM, _R8G8_UNORM, _R16_UNORM.
-    for name, form, pair in (("pyramid", 83, 2), ("surface.maps", 49, 2), ("surface.heights", 56, 1)):
+    formats = {"pyramid": 83, "surface.maps": 49, "surface.horizons": 49, "surface.heights": 56}
+    for name, form in formats.items():
+        pair = 1 if name == "surface.heights" else 2
         data = (tmp_path / "out" / f"{name}.dds").read_bytes()
         levels = [weights[f"{name}.{s}"] for s in range(9) if f"{name}.{s}" in weights] or [weights[name]]
         rows, columns, channels = np.atleast_3d(levels[-1].numpy()).shape

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import astuple, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from mbtf_core.errors import InputError
 from mbtf_fit.config import FitConfig, ModelName, build_model
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.queries import ShardQueries, TrainingQueries
+from mbtf_fit.native import kernel
 from mbtf_fit.objective.parallel import Workers
 from mbtf_fit.sections import TrainingSection
 from mbtf_fit.training.suitable_data import open_data
@@ -67,6 +69,58 @@ def test_levels_that_no_lookup_of_the_data_reads_are_averages(model: str, traine
             size = 2 ** (trained - int(level))
             blocks = before[str(trained)].unfold(0, size, size).unfold(1, size, size)
             torch.testing.assert_close(texels, blocks.mean((-2, -1)))
+
+
+def test_filling_levels_keeps_those_that_are_read_where_levels_are_sums() -> None:
+    t = make_trainer(
+        *(queries(500), Lattice(5, 0.7), "neumip"),
+        **{"steps": 40, "batch": 100, "residual_levels": True, "blur": {"min_sigma": 1.6}},
+    )
+    pyramid = t.model.textures()[0]
+    torch.nn.init.normal_(pyramid.texels, generator=torch.Generator().manual_seed(1))
+    t._read_blurred()
+    before = pyramid.export()["5"]
+    t.fill_levels(5.0)
+    t._read_blurred()
+    after = pyramid.export()
+    assert torch.equal(after["5"], before)
+    torch.testing.assert_close(after["0"].mean((0, 1)), before.mean((0, 1)))
+
+
+@pytest.mark.skipif(kernel() is None, reason="needs the compiled kernel")
+@pytest.mark.parametrize("blur", [{"min_sigma": 1.6}, {"initial_sigma": 0.0, "offset_sigma": 0.0}])
+def test_steps_of_residual_levels_are_those_of_pytorch(
+    blur: dict[str, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = []
+    for used in (kernel(), None):
+        monkeypatch.setattr(mbtf_fit.training.trainer, "kernel", lambda used=used: used)
+        t = make_trainer(
+            *(queries(2000), Lattice(3, 0.7), "neumip"),
+            **{"steps": 40, "batch": 500, "residual_levels": True, "blur": blur},
+        )
+        assert t.backend.startswith("pytorch" if used is None else "kernel")
+        assert t.model.textures()[0].residual
+        residuals = t.model.textures()[0].texels
+        start = residuals.detach().clone()
+        with Workers(torch.device("cpu"), 2) as workers:
+            steps = t.steps(workers, 0)
+            for _ in range(3):
+                next(steps)
+                t.progress.step += 1
+        moment = t.optimizer.state[residuals]["exp_avg"]
+        # Every level learns, the coarsest from the queries of all.
+        starts = t.model.textures()[0].packing.starts
+        assert all(bool(moment[a:b].any()) for a, b in pairwise(starts))
+        found.append((residuals.detach() - start, moment.clone()))
+    for mine, reference in zip(*found, strict=True):
+        assert float((mine - reference).norm()) < 1e-4 * float(reference.norm())
+    # As sums, levels start where independent ones do.
+    plain = make_trainer(queries(2000), Lattice(3, 0.7), "neumip", steps=40, batch=500)
+    pyramid, expected = t.model.textures()[0], plain.model.textures()[0].texels.detach()
+    with torch.no_grad():
+        pyramid.texels.copy_(start)
+    torch.testing.assert_close(pyramid.blurred(0.0).detach(), expected, atol=1e-5, rtol=0)
 
 
 def test_threads_share_a_batch_without_changing_its_gradient() -> None:

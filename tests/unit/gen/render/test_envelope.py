@@ -9,7 +9,8 @@ import pytest
 from support.scenes import mi
 
 from mbtf_core.data.geometry import Geometry
-from mbtf_gen.render.envelope import seen_from_above
+from mbtf_gen.render.envelope import _Half, seen_from_above
+from mbtf_gen.render.scene import build_scene
 from mbtf_gen.tile.fiber_tile import FiberScattering, FiberTile
 from mbtf_gen.tile.fibers.curves import Curve
 from mbtf_gen.tile.mesh_tile import MeshPart, MeshTile
@@ -123,6 +124,17 @@ def test_rays_pass_holes_of_a_mesh() -> None:
     np.testing.assert_allclose(found.heights, 0.0, atol=1e-6)
     assert found.metallic is not None
     assert not found.metallic.any()
+
+
+def test_shadow_rays_pass_holes_of_a_mesh() -> None:
+    for opacity, blocked in ((1.0, True), (0.6, True), (0.4, False)):
+        tile = plates(opacity=opacity)
+        scene = build_scene(tile, tile.surface(REFLECTION))
+        # From between the plates.
+        ray = mi.Ray3f(mi.Point3f(0.0, 0.0, -0.18 * scene.unit), mi.Vector3f(0.0, 0.0, 1.0))
+        holes = {"holes": scene.surface, "rng": _Half()} if opacity < 1.0 else {}
+        found, *_ = scene.geometry.occluded(ray, mi.Mask(True), 1, **holes)
+        assert bool(found[0]) == blocked
 
 
 def test_gaps_of_a_mesh_are_deep_and_flat_and_leave_its_layers() -> None:
