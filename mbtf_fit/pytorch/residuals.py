@@ -63,8 +63,8 @@ def enlarged(texture: Tensor, shape: tuple[int, int]) -> Tensor:
     """A periodic texture (rows, columns, channels) at another resolution, interpolated; differentiable."""
     for axis, size in enumerate(shape):
         left, right, weight = _on(texture.device, size, texture.shape[axis])
-        ends = (texture.index_select(axis, index) for index in (left, right))
-        texture = torch.lerp(*ends, weight.to(texture.dtype).view(-1, *[1] * (2 - axis)))
+        start, end = (texture.index_select(axis, index) for index in (left, right))
+        texture = torch.lerp(start, end, weight.to(texture.dtype).view(-1, *[1] * (2 - axis)))
     return texture
 
 

@@ -324,8 +324,8 @@ class Trainer:
         pyramid.average_coarser(first)
 
     def coverage(self) -> dict[int, float]:
-        """Level → fraction of the pyramid's texels that have received gradients; those of residual levels also
-        come from finer ones."""
+        """Level → fraction of the pyramid's texels that have received gradients; those of residual levels
+        also come from finer ones."""
         pyramid = self.model.textures()[0]
         if not self.hooks.trained()[0]:
             return dict.fromkeys(range(self.model.lattice.finest + 1), 1.0)
