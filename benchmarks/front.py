@@ -6,18 +6,14 @@
 
 For each material, all models are trained on the same data: those of the preset ``draft`` at 128 texels
 across, of five assets and six texture sets. Test queries have 256 paths, and three quarters of them are drawn
-by the highlights: otherwise the noise of highlights hides the differences. All networks have the same width;
-``relief`` traces one, two or four view rays per footprint, and ``neumip+`` learns heights without the
-geometry. On cloth, which is measured where it is named, ``cloth`` takes the place of ``relief``. On the
-materials of Kuznetsov et al. 2021, ``neumip-baseline`` is trained as well, for the ratios that they
-published. ``--ablation`` leaves out one part of a model at a time, on one material (``rock_cliff``
-by default). ``--rock-cliff`` is the benchmark ``rock_cliff-128``: models of their default sizes, a larger
-``neumip`` and the baseline, on the data of ``pipelines/rock_cliff.yaml``, with thresholds of their
-unexplained variance.
+by the highlights. All networks have the same width; ``relief`` traces one, two or four view rays per
+footprint; on cloth, measured where it is named, ``cloth`` takes its place. On the materials of Kuznetsov et
+al. 2021, ``neumip-baseline`` is trained as well. ``--ablation`` leaves out one part of a model at a time, on
+one material (``rock_cliff`` by default). ``--rock-cliff`` is the benchmark ``rock_cliff-128``: models of their
+default sizes, a larger ``neumip`` and the baseline, on the data of ``pipelines/rock_cliff.yaml``.
 
 Training rates are measured first, in turns; nothing else should use the processors then. Fits get the steps
-that the time allows at these rates, so other work does not change them. FOLDER keeps data, rates and errors,
-so the same command resumes. Errors of means are those of the seeds; of one seed, those of the test queries.
+that the time allows at these rates. FOLDER keeps data, rates and errors, so the same command resumes.
 
 The last line is one JSON object. Thresholds: the unexplained variance of ``relief`` over that of ``neumip``
 is at most 0.6 on displaced materials and at most 1 elsewhere (two standard errors).
@@ -96,9 +92,8 @@ MODELS: dict[str, dict[str, Any]] = {
     **{rays: deep_merge(RELIEF, {"network": PARTS["relief"][rays]}) for rays in ("two rays", "four rays")},
 }
 # On cloth, by the same labels.
-CLOTH_MODELS: dict[str, dict[str, Any]] = {
-    label: {**options, "model": "cloth"} if options["model"] == "relief" else options
-    for label, options in MODELS.items()
+CLOTH_MODELS = {
+    label: {**o, "model": "cloth"} if o["model"] == "relief" else o for label, o in MODELS.items()
 }
 THRESHOLDS = {"displaced": 0.6, "any": 1.0}
 STANDARD_ERRORS = 2.0
@@ -117,11 +112,6 @@ BENCHMARK: dict[str, tuple[dict[str, Any], float | None]] = {
 }
 # Least error of the baseline over that of neumip.
 OVER_NEUMIP = 1.2
-
-
-def models_of(name: str) -> dict[str, dict[str, Any]]:
-    """Models that are compared on a material."""
-    return CLOTH_MODELS if name in CLOTHS else MODELS
 
 
 def shards(name: str, folder: Path) -> Path:
@@ -200,7 +190,7 @@ def compared(name: str, folder: Path, steps: dict[str, int], seeds: int) -> dict
             label: train(label, o, data, folder / name, steps[label], seeds) for label, o in models.items()
         }
 
-    fits = fits_of(models_of(name))
+    fits = fits_of(CLOTH_MODELS if name in CLOTHS else MODELS)
     ratio, error = ratio_of(fits["relief"], fits["neumip"])
     extent = Dataset.open(data).manifest["tile"]["displacement_range"]
     limit = THRESHOLDS["displaced" if extent >= DISPLACED else "any"]
@@ -263,11 +253,9 @@ def main() -> int:
         return ablation(arguments.ablation, (arguments.materials or ["rock_cliff"])[0], out, time, seeds)
     names = [n for n in arguments.materials or [*RELIEFS, *HEIGHT_SCALES] if is_available(n)]
     found = []
-    for cloth in (False, True):
-        group = [name for name in names if (name in CLOTHS) == cloth]
-        if group:
-            rates = out / "cloth" if cloth else out
-            steps = steps_of({**models_of(group[0]), **BASELINE}, shards(group[0], out), rates, time)
+    for cloth, models, folder in ((False, MODELS, out), (True, CLOTH_MODELS, out / "cloth")):
+        if group := [name for name in names if (name in CLOTHS) == cloth]:
+            steps = steps_of({**models, **BASELINE}, shards(group[0], out), folder, time)
             found += [compared(name, out, steps, seeds) for name in group]
     return finish(found, THRESHOLDS, bool(found) and all(one["met"] for one in found))
 
