@@ -9,7 +9,7 @@ across, of five assets and six texture sets. Test queries have 256 paths, and th
 by the highlights. All networks have the same width; ``relief`` traces one, two or four view rays per
 footprint; on cloth, measured where it is named, ``cloth`` takes its place. On the materials of Kuznetsov et
 al. 2021, ``neumip-baseline`` is trained as well. ``--ablation`` leaves out one part of a model at a time, on
-one material (``rock_cliff`` by default). ``--rock-cliff`` is the benchmark ``rock_cliff-128``: models of their
+one material (``rock_cliff`` by default). ``--rock-cliff`` is the benchmark ``rock_cliff-128``: models of
 default sizes, a larger ``neumip`` and the baseline, on the data of ``pipelines/rock_cliff.yaml``.
 
 Training rates are measured first, in turns; nothing else should use the processors then. Fits get the steps
