@@ -18,6 +18,7 @@ from mbtf_fit.models.registry import MODELS
 from mbtf_fit.objective.losses import Objective
 from mbtf_fit.objective.noise import NoiseModel
 from mbtf_fit.ops.constants import KNOTS
+from mbtf_fit.pytorch.textures import FeatureTextures
 from mbtf_fit.surface import heightfield
 from mbtf_gen.sampling.query_sampler import slice_directions
 
@@ -82,3 +83,9 @@ def test_slices_stay_on_the_device(name: str) -> None:
     assert {g.device for g in gradients} == {META}
     model.write_textures(slices)
     assert material.pyramid.texels.device == META
+
+
+def test_levels_as_sums_stay_on_the_device() -> None:
+    texture = FeatureTextures(LATTICE, range(LATTICE.finest + 1), 3).to(META)
+    texture.make_residual()
+    assert texture.blurred(1.5).device == META
