@@ -68,32 +68,19 @@ def enlarged(texture: Tensor, shape: tuple[int, int]) -> Tensor:
     return texture
 
 
-def _levels(table: Tensor, packing: Packing) -> list[Tensor]:
-    return [
-        part.view(rows, columns, -1)
-        for part, (rows, columns) in zip(
-            table.split([rows * columns for rows, columns in packing.shapes]), packing.shapes, strict=True
-        )
-    ]
-
-
-def _table(levels: list[Tensor]) -> Tensor:
-    return torch.cat([level.flatten(0, 1) for level in levels])
-
-
 def summed(residuals: Tensor, packing: Packing) -> Tensor:
     """Texels (texels, channels) of all levels from what each adds to the next coarser one; differentiable."""
     out: list[Tensor] = []
-    for level, shape in zip(_levels(residuals, packing), packing.shapes, strict=True):
+    for level, shape in zip(packing.split(residuals), packing.shapes, strict=True):
         out.append(level + enlarged(out[-1], shape) if out else level)
-    return _table(out)
+    return packing.join(out)
 
 
 def residuals_of(texels: Tensor, packing: Packing) -> Tensor:
     """Inverse of :func:`summed`."""
-    levels = _levels(texels, packing)
+    levels = packing.split(texels)
     finer = [
         level - enlarged(coarser, shape)
         for coarser, level, shape in zip(levels, levels[1:], packing.shapes[1:], strict=False)
     ]
-    return _table([levels[0], *finer])
+    return packing.join([levels[0], *finer])

@@ -160,14 +160,9 @@ class FeatureTextures(nn.Module):
         """
         table: Tensor = self.texels
         if sigma > 0 and not self.settled:
-            starts, shapes = self.packing.starts, self.packing.shapes
-            finest = shapes[-1][1]
-            parts = []
-            for s, (rows, columns) in enumerate(shapes):
-                texture = table[starts[s] : starts[s + 1]]
-                blurred = blur_texture(texture.view(rows, columns, -1), sigma * columns / finest)
-                parts.append(blurred.reshape(texture.shape))
-            table = torch.cat(parts)
+            finest = self.packing.shapes[-1][1]
+            levels = self.packing.split(table)
+            table = self.packing.join(blur_texture(x, sigma * x.shape[1] / finest) for x in levels)
         return summed(table, self.packing) if self.residual else table
 
     def average_coarser(self, first: int) -> None:
@@ -182,18 +177,14 @@ class FeatureTextures(nn.Module):
 
     def export(self) -> dict[str, Tensor]:
         """Current table by level, ``0`` the coarsest: (rows, columns, channels) each."""
-        starts, table = self.packing.starts, self.table.detach()
-        return {
-            str(s): table[starts[s] : starts[s + 1]].view(rows, columns, -1).clone()
-            for s, (rows, columns) in enumerate(self.packing.shapes)
-        }
+        levels = self.packing.split(self.table.detach())
+        return {str(s): level.clone() for s, level in enumerate(levels)}
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
         """Load tensors of :meth:`export`, to be read without blur; other entries are ignored."""
         self._table, self.residual, self.settled = None, False, False
         with torch.no_grad():
-            parts = [tensors[str(s)].flatten(0, 1) for s in range(len(self.packing.shapes))]
-            self.texels.copy_(torch.cat(parts))
+            self.texels.copy_(self.packing.join(tensors[str(s)] for s in range(len(self.packing.shapes))))
 
     def forward(self, u: Tensor, level: Tensor | None = None) -> Tensor:
         """Features (n, channels) at uv positions `u` (n, 2); see :func:`~mbtf_fit.surface.lookup.lookup`."""

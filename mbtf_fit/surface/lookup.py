@@ -10,7 +10,7 @@ of the texels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,6 +42,16 @@ class Packing:
     def texels(self) -> int:
         """Rows of the table."""
         return self.starts[-1]
+
+    def split(self, table: Tensor) -> list[Tensor]:
+        """Levels (rows, columns, channels) of a table, which share its memory."""
+        parts = table.split([rows * columns for rows, columns in self.shapes])
+        return [part.view(*shape, -1) for part, shape in zip(parts, self.shapes, strict=True)]
+
+    @staticmethod
+    def join(levels: Iterable[Tensor]) -> Tensor:
+        """Inverse of :meth:`split`."""
+        return torch.cat([level.flatten(0, 1) for level in levels])
 
 
 def coarse_level(level: Tensor, count: int) -> tuple[Tensor, Tensor]:

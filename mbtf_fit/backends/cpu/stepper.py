@@ -180,13 +180,11 @@ class NativeStepper:
         for texture, blur, sums, between, table in zip(
             textures, blurs, self._sums, self._between, self._tables, strict=True
         ):
-            if not blur.idle:
-                blur.apply(texture.texels.detach(), between, table, workers)
-            elif sums is None:
+            if blur.idle and sums is None:
                 texture.read(texture.texels)
                 continue
-            else:
-                table.copy_(texture.texels.detach())
+            # A copy where the blur is idle.
+            blur.apply(texture.texels.detach(), between, table, workers)
             if sums is not None:
                 sums.apply(table, workers)
             texture.read(table)
