@@ -4,7 +4,7 @@
 
 For each material, one fit is evaluated on two test sets: one with the distribution of the training queries,
 and one with ``queries.test_highlights``, whose pilot counts as paths, too. The fit is ``relief``, or
-``neumip`` on cloth, at 64 texels across. FOLDER keeps fits and figures, so the same command resumes.
+``cloth`` on cloth, at 64 texels across. FOLDER keeps fits and figures, so the same command resumes.
 
 The last line is one JSON object. Thresholds: the standard error with highlights is at most 5% of the error,
 and both errors agree within four standard errors where that of the plain set is at most a quarter of its
@@ -19,8 +19,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from common import HEIGHT_SCALES, RELIEFS, finish, is_available, kept, parser_of, start
-from front import NEUMIP, RELIEF
+from common import CLOTHS, HEIGHT_SCALES, RELIEFS, finish, is_available, kept, parser_of, start
+from front import CLOTH_MODELS, RELIEF
 from quality import generator_config
 
 from mbtf_core.config.settings import deep_merge
@@ -31,7 +31,6 @@ from mbtf_fit.data.loader import load_split
 from mbtf_gen.generation.run import generate
 from mbtf_gen.planning.highlights import PILOT_MOST, PILOT_SHARE, PILOT_SPP
 
-CLOTH = ("twill_silk", "basket_weave")
 RESOLUTION, TRAIN = 64, "400/texel"
 STANDARD_ERRORS, RESOLVED = 4.0, 0.25
 THRESHOLDS = {"relative_error": 0.05, "standard_errors": STANDARD_ERRORS}
@@ -62,7 +61,7 @@ def trained(name: str, folder: Path, steps: int) -> None:
     generate(
         config.model_copy(update={"queries": config.queries.model_copy(update=options)}), folder / "train"
     )
-    model = NEUMIP if name in CLOTH else RELIEF
+    model = CLOTH_MODELS["relief"] if name in CLOTHS else RELIEF
     settings = deep_merge(model, {"training": {"steps": steps}})
     fit(FitConfig.model_validate(settings), folder / "train", folder / "fit", overwrite=True)
 
@@ -103,7 +102,7 @@ def main() -> int:
     parser.add_argument("--share", type=float, default=0.75, help="share drawn by highlights")
     parser.add_argument("--steps", type=int, default=1200, help="training steps")
     arguments = parser.parse_args()
-    names = arguments.materials or [*RELIEFS, *HEIGHT_SCALES, *CLOTH]
+    names = arguments.materials or [*RELIEFS, *HEIGHT_SCALES, *CLOTHS]
     found = [
         compared(name, arguments.out / name, arguments.steps, arguments.share, arguments.paths, arguments.spp)
         for name in names
