@@ -30,7 +30,6 @@ from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import expectation
 from mbtf_fit.cli.advice import advise
-from mbtf_fit.cli.live import Live, live_view
 from mbtf_fit.config import DEFAULT_MODEL, FitConfig, ModelName, best_model
 from mbtf_fit.formatting import describe_fit, fits_table
 
@@ -55,7 +54,6 @@ def fit(
         int | None, Parameter(converter=whole_number, show_default="one per GPU, or 1", group=MORE)
     ] = None,
     shared_decoder: Annotated[Switch, Parameter(group=MORE)] = False,
-    live: Live = False,
     tensorboard: Annotated[Path | None, Parameter(metavar="FOLDER", group=MORE)] = None,
     cluster: ClusterOption = None,
     dry_run: DryRun = False,
@@ -88,7 +86,6 @@ def fit(
     for refused, what, hint in (
         (many is not None and shards is not None, "--many replaces the argument SHARDS", "leave out one"),
         (many is not None and dry_run, "--dry-run takes one data set", "mbtf-fit shards/ --dry-run"),
-        (many is not None and live, "--live shows one fit", "leave out --many, or --live"),
         (many is not None and bool(tensorboard), "--tensorboard shows one fit", "leave out one of them"),
         (many is None and shared_decoder, "--shared-decoder requires --many", "mbtf-fit --many a/ b/ ..."),
         (many is None and processes is not None, "--processes requires --many", "mbtf-fit --many a/ b/ ..."),
@@ -117,7 +114,7 @@ def fit(
     folder = DataFolder.open(shards)
     config = resolve_config(options, quality, folder)
     if not dry_run:
-        _fit_one(config, folder, output, live, tensorboard, overwrite, verbose, console)
+        _fit_one(config, folder, output, tensorboard, overwrite, verbose, console)
         return
     from mbtf_fit.training.forecast import forecast_fit
 
@@ -130,13 +127,12 @@ def _fit_one(
     config: FitConfig,
     shards: DataFolder,
     output: Path,
-    live: bool,
     tensorboard: Path | None,
     overwrite: bool,
     verbose: bool,
     console: Console,
 ) -> None:
-    """Fit a data set, watched by whoever asks for it."""
+    """Fit a data set, and report."""
     from mbtf_fit.material.format import DESCRIPTION_NAME
     from mbtf_fit.training.endings import describe_ending, describe_kept
     from mbtf_fit.training.fit import fit
@@ -147,26 +143,16 @@ def _fit_one(
         _announce(config, [shards], output, f"{shards} -> {output}: {config.model}", console)
     with (
         nullcontext() if tensorboard is None else EventLog(tensorboard) as log,
-        live_view(str(output), live, console) as shown,
         console.progress(total=100, label="reading", unit="%") as bar,
     ):
-        curves = None if shown is None else shown.observer(output.name)
-        observers = [observer for observer in (curves, log) if observer is not None]
-
-        def observe(*validation: Any) -> None:
-            for observer in observers:
-                observer(*validation)
-
         result = fit(
             config,
             shards,
             output,
             overwrite=overwrite,
             progress=_training_progress(bar, output),
-            observe=observe if observers else None,
+            observe=log,
         )
-        if shown is not None:
-            shown.finished(output.name, output)
     if finished:
         console.note(f"{output}: this fit is already finished; --overwrite trains it again")
     command, advice = advise(result.material, output, shards, result.history, result.errors)

@@ -25,7 +25,6 @@ from mbtf_core.app.options import (
 from mbtf_core.errors import InputError, MbtfError, PartialError, UsageError
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import clock
-from mbtf_fit.cli.live import Live, live_view
 from mbtf_gen.config.pictures import EXPOSURE
 
 if TYPE_CHECKING:
@@ -43,7 +42,6 @@ def run(
     quick: Switch = False,
     dry_run: DryRun = False,
     force: Switch = False,
-    live: Live = False,
     cluster: ClusterOption = None,
     assignments: Set = None,
     console: Console = CONSOLE,
@@ -71,13 +69,13 @@ def run(
     given = {"quality": quality, "error": error, "quick": quick, "output": output, "set": assignments}
     command = command_line("mbtf-pipeline", "run", recipe, **given)
     loaded, own = load(recipe, assignments or []), assignments or []
-    flags = given | {"live": live, "dry_run": dry_run}
+    flags = given | {"dry_run": dry_run}
     check_error(error)
     if isinstance(loaded, Collection):
         from mbtf_pipeline.collection.run import run_collection
 
         hint = "set times in the recipe; --quick is its small size"
-        _refuse(flags, ("quality", "error", "dry_run", "live"), "a recipe of several materials", hint)
+        _refuse(flags, ("quality", "error", "dry_run"), "a recipe of several materials", hint)
         folder = output or loaded.folder_of(quick)
         keep_on_interruption(f"the finished stages are kept in {folder}")
         # A crash ends one material of a library alone; the runs of a paper show their progress.
@@ -119,14 +117,13 @@ def run(
         keep_on_interruption(f"the finished stages are kept in {folder}")
         from mbtf_pipeline.run import run_recipe
 
-        with open_runner(cluster, console.note) as runner, live_view(loaded.title, live, console) as page:
+        with open_runner(cluster, console.note) as runner:
             result = run_recipe(
                 loaded,
                 folder,
                 force=force,
                 command=command,
                 console=console,
-                live=page,
                 runner=runner,
             )
         _report(result, console, quality, partial(_next_command, recipe, single, given))
