@@ -75,8 +75,7 @@ ErrorOption = Annotated[
     Parameter(
         name="--error",
         metavar="FLOAT",
-        help="Unexplained variance at which training stops: validation error plus its standard error; "
-        "a cost study forecasts the time.",
+        help="Unexplained variance at which training stops: validation error plus its standard error.",
     ),
 ]
 

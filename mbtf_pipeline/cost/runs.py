@@ -38,20 +38,16 @@ from mbtf_pipeline.cost.measurement import Conditions, Configuration, Measuremen
 if TYPE_CHECKING:
     from mbtf_fit.data.queries import ShardQueries
 
-# Shares of a study's time that the generator and the runs get. The rest is left for start-up, the test set,
-# loading and evaluation.
+# Shares of a study's time that comparisons of the generator and runs get. The rest is left for start-up, the
+# test set, loading and evaluation. The first seconds are for runs alone.
 GENERATOR, RUNS = 0.1, 0.7
+RUNS_ALONE = 90.0
 # Total times of runs, seconds: this one, twice, four times, ...; the share of each that generates.
 SHORTEST = 6.0
 SHARE, OTHER_SHARES = 0.35, (0.6, 0.15)
 _FEWEST_QUERIES = 20_000
 # Fewest training steps of a run: the error of a shorter fit says nothing about longer ones.
 FEWEST_STEPS = 200
-# Series of a run for which they took longer than planned.
-SLOW_SERIES = f"{FEWEST_STEPS} training steps"
-# Fewest total times that tell how the error falls, and the study's seconds in which they are measured.
-FEWEST_TOTALS = 3
-LEAST_SECONDS = SHORTEST * (2**FEWEST_TOTALS - 1 + 2 ** (FEWEST_TOTALS - 1) - 1) / RUNS
 # Test queries, and paths of each.
 TEST = (1 << 18, 16)
 # The smallest split that the generator takes.

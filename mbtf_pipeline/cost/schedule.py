@@ -21,15 +21,11 @@ from mbtf_pipeline.cost.measurement import (
     measure,
 )
 from mbtf_pipeline.cost.runs import (
-    FEWEST_TOTALS,
     GENERATOR,
-    LEAST_SECONDS,
-    SHORTEST,
-    SLOW_SERIES,
+    RUNS_ALONE,
     TEST,
     Run,
     planned_runs,
-    shortest_total,
 )
 
 # Seconds by which a run exceeds generating and training on a machine without other work, until one has been
@@ -98,8 +94,7 @@ class Measurements:
         if self.recall(first):
             self.step_seconds = _step_seconds(self.found[first.label])
         runs = planned_runs(seconds, spp, self.path_seconds, self.step_seconds)
-        # With its few queries it follows another law than the others.
-        return runs if first in runs else [replace(first, series=SLOW_SERIES), *runs]
+        return runs if first in runs else [first, *runs]
 
     def recall(self, configuration: Configuration) -> bool:
         """Whether a measurement is stored; it then counts as found."""
@@ -144,47 +139,11 @@ class Measurements:
             self.store.put(configuration, done.value)
             self.tested = self.tested or isinstance(configuration, Run)
 
-    @property
-    def test_seconds(self) -> float:
-        """Expected seconds of making the test set."""
-        return TEST[0] * TEST[1] * self.path_seconds
-
     def expected_seconds(self, run: Run) -> float:
         """Expected seconds of measuring a run, the first one with the test set."""
         planned = run.planned_seconds(self.path_seconds, self.step_seconds)
-        return planned + (0.0 if self.tested else self.test_seconds) + self.overhead
-
-    def fitting(self, runs: Sequence[Run], before: float, seconds: float) -> tuple[list[Run], float]:
-        """The runs that are not measured yet and are expected to fit into a time, after `before` seconds
-        without runs; and the seconds of everything."""
-        found, spent, test = list[Run](), before, 0.0 if self.tested else self.test_seconds
-        for run in runs:
-            after = spent + run.planned_seconds(self.path_seconds, self.step_seconds) + self.overhead + test
-            if not self.recall(run) and after <= seconds:
-                found.append(run)
-                spent, test = after, 0.0
-        return found, spent
-
-    def least_seconds(self, spp: int, setup: float) -> float | None:
-        """Seconds of a study that measures runs of enough lengths for a forecast, by what runs have taken on
-        this machine, after `setup` seconds of loading and reference; None where they are measured."""
-        enough = LEAST_SECONDS * shortest_total(self.step_seconds) / SHORTEST
-        needed = planned_runs(enough, spp, self.path_seconds, self.step_seconds)[:FEWEST_TOTALS]
-        missing = [run for run in needed if not self.recall(run)]
-        return max(LEAST_SECONDS, self._study_seconds(missing, setup)) if missing else None
-
-    def least_run_seconds(self, spp: int, setup: float) -> float | None:
-        """Likewise of a study that measures one run; None where any is measured."""
-        runs = planned_runs(0.0, spp, self.path_seconds)
-        return None if self._besides else self._study_seconds(runs, setup)
-
-    def _study_seconds(self, runs: Sequence[Run], setup: float) -> float:
-        """Seconds of a study that has time for some runs, and makes the test set anew."""
-        planned = (run.planned_seconds(self.path_seconds, self.step_seconds) for run in runs)
-        needed = setup + self.test_seconds + sum(planned) + len(runs) * self.overhead
-        # Of what exceeds the least time of all machines, the generator gets its share.
-        share = COMPILING * GENERATOR
-        return max(needed, (needed - share * LEAST_SECONDS) / (1.0 - share))
+        test = 0.0 if self.tested else TEST[0] * TEST[1] * self.path_seconds
+        return planned + test + self.overhead
 
     def fits(self, run: Run, seconds: float) -> bool:
         """Whether the workers can begin and finish a run in a time, besides those that they have taken."""
@@ -209,8 +168,8 @@ class Measurements:
 
 
 def generator_seconds(seconds: float) -> float:
-    """Time for comparisons of the generator: a share of what a study has beyond the least that forecasts."""
-    return GENERATOR * max(0.0, seconds - LEAST_SECONDS)
+    """Time of a study for comparisons of the generator."""
+    return GENERATOR * max(0.0, seconds - RUNS_ALONE)
 
 
 def _step_seconds(run: Measurement) -> float:
