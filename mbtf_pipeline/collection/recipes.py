@@ -18,7 +18,7 @@ from mbtf_pipeline.collection.materials import find_materials, name_materials
 from mbtf_pipeline.compare.perceptual_metrics import weights_file
 from mbtf_pipeline.recipe import Name, Recipe, load_recipe, read_recipe
 
-TableName = Literal["methods", "levels", "ablations", "timing", "offsets", "zooms", "ranking"]
+TableName = Literal["methods", "levels", "ablations", "timing", "ranking"]
 # The name of a fit that is repeated: what is trained, and the seed.
 _SEEDED = re.compile(r"(.+)-seed([0-9]+)")
 
