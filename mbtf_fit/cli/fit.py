@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +13,6 @@ from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.help import MORE
 from mbtf_core.app.options import (
     ClusterOption,
-    DryRun,
     Options,
     Output,
     Overwrite,
@@ -56,7 +54,6 @@ def fit(
     shared_decoder: Annotated[Switch, Parameter(group=MORE)] = False,
     tensorboard: Annotated[Path | None, Parameter(metavar="FOLDER", group=MORE)] = None,
     cluster: ClusterOption = None,
-    dry_run: DryRun = False,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
     console: Console = CONSOLE,
@@ -66,8 +63,7 @@ def fit(
     The same command again resumes an unfinished fit. --time is that of training; the first line says about
     how long reading, calibration and errors take beside it. Errors, the validation error too, are those of
     test queries, which no fit is trained on. --quality trains 800 steps at least, even if they take longer,
-    as does --time "12s, at least 800 steps". --dry-run forecasts time and size by some seconds of training on
-    this machine. With --many, the output folder holds one folder per material.
+    as does --time "12s, at least 800 steps". With --many, the output folder holds one folder per material.
 
     Parameters
     ----------
@@ -85,7 +81,6 @@ def fit(
     """
     for refused, what, hint in (
         (many is not None and shards is not None, "--many replaces the argument SHARDS", "leave out one"),
-        (many is not None and dry_run, "--dry-run takes one data set", "mbtf-fit shards/ --dry-run"),
         (many is not None and bool(tensorboard), "--tensorboard shows one fit", "leave out one of them"),
         (many is None and shared_decoder, "--shared-decoder requires --many", "mbtf-fit --many a/ b/ ..."),
         (many is None and processes is not None, "--processes requires --many", "mbtf-fit --many a/ b/ ..."),
@@ -113,14 +108,7 @@ def fit(
 
     folder = DataFolder.open(shards)
     config = resolve_config(options, quality, folder)
-    if not dry_run:
-        _fit_one(config, folder, output, tensorboard, overwrite, verbose, console)
-        return
-    from mbtf_fit.training.forecast import forecast_fit
-
-    expected = forecast_fit(config, folder)
-    data = {"shards": str(folder), "model": config.model, "forecast": asdict(expected)}
-    console.report(data, expected.describe())
+    _fit_one(config, folder, output, tensorboard, overwrite, verbose, console)
 
 
 def _fit_one(

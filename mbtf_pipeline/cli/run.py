@@ -102,8 +102,7 @@ def run(
         # The file may be another one when the run has ended.
         single = is_single(explicit_options(recipe, own)["fit"])
         loaded = preset_recipe(recipe, quality, own)
-        draft = partial(preset_recipe, recipe, "draft", own)
-        if not dry_run and (expected := forecast_left(loaded, folder, draft)) is not None:
+        if not dry_run and (expected := forecast_left(loaded, folder)) is not None:
             console.note(expected)
         if error is not None:
             loaded = with_error(loaded, error)

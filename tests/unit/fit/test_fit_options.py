@@ -82,7 +82,6 @@ def test_a_held_out_direction_lies_on_the_disk() -> None:
     [
         ("", "no shards given"),
         ("a --many b", "--many replaces the argument SHARDS"),
-        ("--many a --dry-run", "--dry-run takes one data set"),
         ("a --cluster local", "--cluster requires --many"),
         ("--many a --processes 2 --cluster local", "--cluster sets the processes"),
     ],
