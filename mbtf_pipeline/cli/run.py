@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -95,12 +94,9 @@ def run(
     else:
         _refuse(flags, ("quick",), "a recipe of one material", "use --quality draft")
         folder = output or loaded.folder
-        from mbtf_core.config.settings import explicit_options
         from mbtf_pipeline.forecast import RunForecaster, forecast_left
-        from mbtf_pipeline.recipe import is_single, preset_recipe, with_error
+        from mbtf_pipeline.recipe import preset_recipe, with_error
 
-        # The file may be another one when the run has ended.
-        single = is_single(explicit_options(recipe, own)["fit"])
         loaded = preset_recipe(recipe, quality, own)
         if not dry_run and (expected := forecast_left(loaded, folder)) is not None:
             console.note(expected)
@@ -125,7 +121,7 @@ def run(
                 console=console,
                 runner=runner,
             )
-        _report(result, console, quality, partial(_next_command, recipe, single, given))
+        _report(result, console, quality)
 
 
 def _refuse(given: Mapping[str, Any], flags: Sequence[str], kind: str, hint: str) -> None:
@@ -151,27 +147,7 @@ def _report_collection(done: CollectionResult, folder: Path, console: Console) -
         )
 
 
-def _next_command(
-    file: Path, single: bool, given: Mapping[str, Any], options: Mapping[str, dict[str, str]]
-) -> str | None:
-    """The command of a run, `given` its own options, with those that its fits, by name, need; None where they
-    need none. `single`: the recipe has no name for its fit."""
-    own, changes = given["set"] or [], dict[str, str]()
-    for name, needed in options.items():
-        changes |= {k.replace("fit", "fit" if single else f"fit.{name}", 1): v for k, v in needed.items()}
-    if not changes:
-        return None
-    kept = [text for text in own if text.partition("=")[0].strip() not in changes]
-    more = [*kept, *(f"{key}={value}" for key, value in changes.items())]
-    return command_line("mbtf-pipeline", "run", file, **{**given, "set": more})
-
-
-def _report(
-    result: RunResult,
-    console: Console,
-    quality: Quality | None,
-    again: Callable[[Mapping[str, Any]], str | None],
-) -> None:
+def _report(result: RunResult, console: Console, quality: Quality | None) -> None:
     from mbtf_fit import Material
     from mbtf_fit.cli.advice import suggest
     from mbtf_fit.formatting import outliers, unreliable
@@ -186,8 +162,7 @@ def _report(
     ran = {name: stage.seconds for name, stage in result.stages.items() if stage.reason}
     times = ", ".join(f"{name} {clock(seconds)}" for name, seconds in ran.items())
     lines = [f"{result.report}: {times or 'everything up to date'}"]
-    fits, options, recipe = {}, {}, read_resolved(folder)
-    queries = recipe.generate.queries.model_dump(mode="json")
+    fits, recipe = {}, read_resolved(folder)
     for fit, record in result.comparison["test"].items():
         errors, history = record["splits"]["test"], read_history(folder / FITS / fit)
         ending = describe_ending(recipe.fit[fit], history)
@@ -206,10 +181,6 @@ def _report(
         lines.append(f"  {name}: unexplained variance {estimate(errors['unexplained'])}{few}")
         more = [*outliers(errors), ending, fits[fit]["advice"]]
         lines += [f"    {line}" for line in more if line]
-        if step is not None:
-            options[fit] = step.options(recipe.fit[fit], record["training_seconds"], queries)
-    command = again(options)
-    lines += [] if command is None else ["next:", f"  {command}"]
     if result.viewer is not None:
         lines.append(f"{result.viewer}: open it in a browser to turn the fits under lights")
     data = {
@@ -223,7 +194,6 @@ def _report(
             for name, stage in result.stages.items()
         },
         "test": fits,
-        "next_command": command,
     }
     console.report(data, "\n".join(lines))
 
