@@ -17,7 +17,7 @@ from mbtf_core.color import ALBEDO_EXPOSURE, to_display
 from mbtf_core.data.geometry import Geometry
 from mbtf_core.data.shard_files import Arrays
 from mbtf_core.files.atomic import Stored, write_chunks
-from mbtf_gen.measured.exported import mean_of
+from mbtf_gen.publishing.facts import mean_of
 
 F64 = NDArray[np.float64]
 PICTURE_NAME = "contact_sheet.png"
