@@ -12,13 +12,11 @@ from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import (
     ClusterOption,
     DryRun,
-    ErrorOption,
     Output,
     Quality,
     QualityOption,
     Set,
     Switch,
-    check_error,
     command_line,
 )
 from mbtf_core.errors import InputError, MbtfError, PartialError, UsageError
@@ -37,7 +35,6 @@ def run(
     *,
     output: Annotated[Output | None, Parameter(show_default="out/NAME")] = None,
     quality: QualityOption = None,
-    error: ErrorOption = None,
     quick: Switch = False,
     dry_run: DryRun = False,
     force: Switch = False,
@@ -65,16 +62,15 @@ def run(
     from mbtf_core.run.processes import Processes
     from mbtf_pipeline.collection.recipes import Collection, LibraryRecipe, load
 
-    given = {"quality": quality, "error": error, "quick": quick, "output": output, "set": assignments}
+    given = {"quality": quality, "quick": quick, "output": output, "set": assignments}
     command = command_line("mbtf-pipeline", "run", recipe, **given)
     loaded, own = load(recipe, assignments or []), assignments or []
     flags = given | {"dry_run": dry_run}
-    check_error(error)
     if isinstance(loaded, Collection):
         from mbtf_pipeline.collection.run import run_collection
 
         hint = "set times in the recipe; --quick is its small size"
-        _refuse(flags, ("quality", "error", "dry_run"), "a recipe of several materials", hint)
+        _refuse(flags, ("quality", "dry_run"), "a recipe of several materials", hint)
         folder = output or loaded.folder_of(quick)
         keep_on_interruption(f"the finished stages are kept in {folder}")
         # A crash ends one material of a library alone; the runs of a paper show their progress.
@@ -95,13 +91,11 @@ def run(
         _refuse(flags, ("quick",), "a recipe of one material", "use --quality draft")
         folder = output or loaded.folder
         from mbtf_pipeline.forecast import RunForecaster, forecast_left
-        from mbtf_pipeline.recipe import preset_recipe, with_error
+        from mbtf_pipeline.recipe import preset_recipe
 
         loaded = preset_recipe(recipe, quality, own)
         if not dry_run and (expected := forecast_left(loaded, folder)) is not None:
             console.note(expected)
-        if error is not None:
-            loaded = with_error(loaded, error)
         if dry_run:
             forecaster = RunForecaster(loaded)
             forecaster.job.announce_briefly()
