@@ -133,11 +133,11 @@ def _fit_one(
         )
     if finished:
         console.note(f"{output}: this fit is already finished; --overwrite trains it again")
-    command, advice = advise(result.material, output, shards, result.history, result.errors)
-    summary = {**result.as_dict(), "next_command": command}
+    advice = advise(result.material, shards, result.history, result.errors)
+    summary = {**result.as_dict(), "advice": advice}
     ending = describe_ending(config, result.history)
     kept = describe_kept(result.history, result.kept_step)
-    more = [*(line for line in (kept, ending) if line is not None), *advice]
+    more = [line for line in (kept, ending, advice) if line is not None]
     console.report(summary, "\n".join([describe_fit(summary, verbose), *more]))
 
 

@@ -68,15 +68,6 @@ def training_digest(data: Dataset) -> str:
     return data_sha256([shard.sidecar["sha256"] for shard in data.shards("train")])
 
 
-def configuration_digest(data: Dataset) -> str | None:
-    """SHA-256 of the generator's configuration but for the number of training queries and the options of test
-    queries; None where it is unknown."""
-    config = data.manifest.get("config") or {}
-    queries = config.get("queries") or {}
-    same = {k: v for k, v in queries.items() if k != "train" and not k.startswith("test")}
-    return data_sha256({**config, "queries": same}) if queries else None
-
-
 def claim(out: Path, identity: dict[str, Any], config: FitConfig, overwrite: bool) -> OutputFolder:
     """Claim the folder for a fit, or check that it already belongs to it."""
     return OutputFolder.claim(
