@@ -21,7 +21,6 @@ from mbtf_core.app.options import (
     Switch,
     Verbose,
     options_from,
-    whole_number,
 )
 from mbtf_core.app.progress import Progress
 from mbtf_core.errors import InputError, PartialError, UsageError
@@ -48,9 +47,6 @@ def fit(
     quality: QualityOption = None,
     options: FitOptions = FitOptions(),  # noqa: B008
     many: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
-    processes: Annotated[
-        int | None, Parameter(converter=whole_number, show_default="one per GPU, or 1", group=MORE)
-    ] = None,
     shared_decoder: Annotated[Switch, Parameter(group=MORE)] = False,
     cluster: ClusterOption = None,
     overwrite: Overwrite = False,
@@ -71,18 +67,13 @@ def fit(
     many
         Fit several data sets, one material each: folders made by mbtf-gen, or folders of such folders. A fit
         that fails does not stop the others.
-    processes
-        With --many, number of simultaneous fits.
     shared_decoder
         With --many, fit all data sets together with one network. --time is that of all of them.
     """
     for refused, what, hint in (
         (many is not None and shards is not None, "--many replaces the argument SHARDS", "leave out one"),
         (many is None and shared_decoder, "--shared-decoder requires --many", "mbtf-fit --many a/ b/ ..."),
-        (many is None and processes is not None, "--processes requires --many", "mbtf-fit --many a/ b/ ..."),
         (many is None and cluster is not None, "--cluster requires --many", "mbtf-fit --many a/ b/ ..."),
-        (bool(processes) and cluster is not None, "--cluster sets the processes", "leave out --processes"),
-        (processes is not None and processes < 1, "--processes must be positive", ""),
     ):
         if refused:
             raise UsageError(what, hint=hint)
@@ -91,7 +82,7 @@ def fit(
             options = options.assigning("training.shared_decoder=true")
         made = not output.exists()
         try:
-            _fit_many(options, quality, many, output, processes, cluster, overwrite, console)
+            _fit_many(options, quality, many, output, cluster, overwrite, console)
         finally:
             # It is empty where every fit failed at once.
             with suppress(OSError):
@@ -224,7 +215,6 @@ def _fit_many(
     quality: Quality | None,
     many: list[Path],
     output: Path,
-    processes: int | None,
     cluster: str | None,
     overwrite: bool,
     console: Console,
@@ -237,11 +227,10 @@ def _fit_many(
     config = resolve_config(options, quality, *shards)
     if not config.training.shared_decoder:
         configs = [resolve_config(options, quality, folder) for folder in shards]
-        _fit_each(configs, shards, folders, output, processes, cluster, overwrite, console)
+        _fit_each(configs, shards, folders, output, cluster, overwrite, console)
         return
-    if processes is not None or cluster is not None:
-        flag = "--cluster" if processes is None else "--processes"
-        raise UsageError(f"a shared network is one fit: leave out {flag}")
+    if cluster is not None:
+        raise UsageError("a shared network is one fit: leave out --cluster")
     from mbtf_fit.training.endings import describe_kept
     from mbtf_fit.training.fit import fit_jointly
 
@@ -272,20 +261,18 @@ def _fit_each(
     shards: Sequence[Path],
     folders: Sequence[Path],
     output: Path,
-    processes: int | None,
     cluster: str | None,
     overwrite: bool,
     console: Console,
 ) -> None:
-    """Fit several data sets, in processes of their own or on a cluster."""
+    """Fit several data sets, in processes of their own, one per GPU at a time, or on a cluster."""
+    import torch
+
     from mbtf_core.run.cluster import open_runner
     from mbtf_core.run.processes import Processes
     from mbtf_fit.training.fit_many import fit_many
 
-    if processes is None:
-        import torch
-
-        processes = max(1, torch.cuda.device_count()) if configs[0].device != "cpu" else 1
+    processes = max(1, torch.cuda.device_count()) if configs[0].device != "cpu" else 1
     models = " and ".join(sorted({config.model for config in configs}))
     console.note(f"{len(shards)} data sets -> {output}: {models}")
     keep_on_interruption(f"finished fits and the last checkpoints are kept in {output}")
