@@ -9,7 +9,6 @@ from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import (
-    ClusterOption,
     Output,
     Set,
     command_line,
@@ -23,15 +22,13 @@ def cost(
     *,
     output: Annotated[Output | None, Parameter(show_default="out/NAME-cost")] = None,
     time: Annotated[str, Parameter(metavar="DURATION")] = "10min",
-    cluster: ClusterOption = None,
     assignments: Set = None,
     console: Console = CONSOLE,
 ) -> None:
     """Measure error against time for this material and machine.
 
     Writes cost.html, cost.csv and PNGs: the errors of complete runs, and of the generator's options. The same
-    command resumes. A longer time keeps all measurements and adds longer runs. With --cluster, workers
-    measure, each for itself.
+    command resumes. A longer time keeps all measurements and adds longer runs.
 
     Parameters
     ----------
@@ -41,7 +38,6 @@ def cost(
         Time budget: 90s, 2min, 1h.
     """
     from mbtf_core.files.folders import owned
-    from mbtf_core.run.cluster import open_runner
     from mbtf_core.run.signals import keep_on_interruption
     from mbtf_core.units import asked_duration, clock
     from mbtf_fit.config import DEFAULT_MODEL
@@ -59,10 +55,7 @@ def cost(
     seconds = asked_duration(time, "--time")
     folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")
     keep_on_interruption(f"the measurements are kept in {folder}")
-    with (
-        open_runner(cluster, console.note) as runner,
-        console.progress(total=100, label="cost", unit="%") as bar,
-    ):
+    with console.progress(total=100, label="cost", unit="%") as bar:
         study = run_study(
             loaded,
             folder,
@@ -71,12 +64,10 @@ def cost(
                 *("mbtf-pipeline", "cost", recipe),
                 time=time,
                 output=output,
-                cluster=cluster,
                 set=assignments,
             ),
             announce=console.note,
             progress=lambda share, note: bar.update(round(100 * share, 1), note),
-            runner=runner,
         )
     with owned(folder):
         page = write_page(study)

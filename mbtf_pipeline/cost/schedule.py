@@ -8,9 +8,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import count, takewhile
 
-from mbtf_core.errors import PartialError
-from mbtf_core.run.runner import Runner
-from mbtf_core.run.task import Item
+from mbtf_core.errors import MbtfError, PartialError
+from mbtf_core.run.task import failure
 from mbtf_core.units import clock
 from mbtf_pipeline.cost.generator import benchmark_of, generator_configurations, path_seconds
 from mbtf_pipeline.cost.measurement import (
@@ -42,7 +41,7 @@ class Measurements:
 
     Attributes
     ----------
-    conditions, store, runner : what measures, and where the results are kept
+    conditions, store : what a measurement needs, and where the results are kept
     note : called when a configuration is taken, with its label and the time that it is expected to take
     failed : why runs failed
     path_seconds, step_seconds : seconds of generating a query over its number of paths; of a training step
@@ -51,15 +50,12 @@ class Measurements:
 
     conditions: Conditions
     store: MeasurementFolder
-    runner: Runner
     note: Callable[[str], None] = lambda label: None
     found: dict[str, Measurement] = field(default_factory=dict)
     failed: dict[str, str] = field(default_factory=dict)
     path_seconds: float = 0.0
     step_seconds: float = 0.0
     share: float = 1.0
-    # Taken, but not measured yet.
-    _pending: dict[str, Configuration] = field(default_factory=dict)
     # Whether a run has made the test set.
     tested: bool = False
     # Seconds of measured runs besides the test set, generating and training.
@@ -110,33 +106,30 @@ class Measurements:
         self.found[configuration.label] = measurement
 
     def measure(self, wanted: Iterable[Configuration], *, independent: bool) -> None:
-        """Measure configurations; each is taken once a worker is nearly free.
+        """Measure configurations, one after the other.
 
-        One that fails says nothing about others that are `independent`; it is an InputError for those that
-        are not. A PartialError where a worker died, or the disk is full.
+        One that fails says nothing about others that are `independent`; its error is raised for those that
+        are not. A PartialError where the disk is full.
         """
-
-        def items() -> Iterator[Item]:
-            for configuration in wanted:
-                self._pending[configuration.label] = configuration
-                left = ""
-                if isinstance(configuration, Run):
-                    left = f", about {clock(self.expected_seconds(configuration))}"
-                self.note(configuration.label + left)
-                arguments = {"configuration": configuration, "conditions": self.conditions}
-                yield Item(configuration.label, arguments)
-
-        for done in self.runner.map(measure, items(), independent=independent, ahead=0):
-            configuration = self._pending.pop(done.name)
-            if done.error and not done.fatal:
-                raise PartialError(f"{done.name} failed: {done.error}", hint=done.hint or RESUMES)
-            if done.error:
+        for configuration in wanted:
+            label, left = configuration.label, ""
+            if isinstance(configuration, Run):
+                left = f", about {clock(self.expected_seconds(configuration))}"
+            self.note(label + left)
+            try:
+                measured = measure(configuration, self.conditions)
+            except PartialError as error:
+                what = failure(error)["error"]
+                raise PartialError(f"{label} failed: {what}", hint=error.hint or RESUMES) from None
+            except MbtfError as error:
+                if not independent:
+                    raise
                 # The other runs are worth a page all the same.
-                self.failed[done.name] = done.error
+                self.failed[label] = failure(error)["error"]
                 continue
-            self._add(configuration, done.value)
-            self.note(f"{done.name}: done")
-            self.store.put(configuration, done.value)
+            self._add(configuration, measured)
+            self.note(f"{label}: done")
+            self.store.put(configuration, measured)
             self.tested = self.tested or isinstance(configuration, Run)
 
     def expected_seconds(self, run: Run) -> float:
@@ -146,9 +139,8 @@ class Measurements:
         return planned + test + self.overhead
 
     def fits(self, run: Run, seconds: float) -> bool:
-        """Whether the workers can begin and finish a run in a time, besides those that they have taken."""
-        taken = sum(self.expected_seconds(r) for r in self._pending.values() if isinstance(r, Run))
-        return max(1, self.runner.workers) * seconds - taken > self.expected_seconds(run)
+        """Whether a run can begin and finish in a time."""
+        return seconds > self.expected_seconds(run)
 
     def group(self, run: Run) -> list[Measurement]:
         """The measurements of a run with the first seeds, without gaps."""

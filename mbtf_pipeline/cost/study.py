@@ -1,26 +1,19 @@
-"""A cost study: measures what accuracy costs within a given time, and resumes where it stopped.
-
-Measurements are tasks: this process does them one after the other, the workers of a cluster each for itself.
-A worker generates data and fits as a process of its own would, and measures the time itself, so that all
-figures are of the workers' machine and threads.
-"""
+"""A cost study: measures what accuracy costs within a given time, and resumes where it stopped."""
 
 from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from mbtf_core.config.yaml_file import dump_yaml
-from mbtf_core.errors import InputError, PartialError
+from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json
 from mbtf_core.files.editable import write_document
 from mbtf_core.files.folders import ELSEWHERE, OutputKind, check_space, owned
-from mbtf_core.run.runner import Runner
-from mbtf_core.run.task import Item, worker_threads
 from mbtf_core.stats import Estimate
 from mbtf_core.units import expectation, format_duration
 from mbtf_gen.config.generator import GeneratorConfig
@@ -36,7 +29,7 @@ from mbtf_pipeline.cost.measurement import (
     seed_deviation,
 )
 from mbtf_pipeline.cost.runs import GENERATOR, Run, disk_bytes, test_set
-from mbtf_pipeline.cost.schedule import COMPILING, RESUMES, Measurements, generator_seconds
+from mbtf_pipeline.cost.schedule import COMPILING, Measurements, generator_seconds
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.stages import machine
 from mbtf_pipeline.tables import is_significant
@@ -81,19 +74,11 @@ def study_config(config: GeneratorConfig) -> GeneratorConfig:
     return config.model_copy(update={"queries": config.queries.model_copy(update=own)})
 
 
-def measuring_machine() -> dict[str, str]:
-    """Record of the machine that runs it; a task."""
-    found = machine()
-    if (threads := worker_threads()) is not None:
-        found["system"] += f", workers of {threads} thread{'s' * (threads != 1)}"
-    return found
-
-
-def claim(folder: Path, on: Mapping[str, str]) -> None:
-    """Take an empty folder, or one that holds a study of the kind of machine that measures."""
+def claim(folder: Path) -> None:
+    """Take an empty folder, or one that holds a study of this kind of machine."""
     if not STUDY.check(folder):
         return
-    there, here = read_json(folder / STUDY.record)["machine"]["system"], on["system"]
+    there, here = read_json(folder / STUDY.record)["machine"]["system"], machine()["system"]
     if there != here:
         problem = f"holds a cost study of another kind of machine ({there}; this is {here})"
         raise InputError(problem, where=folder, hint=ELSEWHERE)
@@ -107,7 +92,6 @@ def run_study(
     command: str = "",
     progress: Callable[[float, str], None] = lambda share, note: None,
     announce: Callable[[str], None] = lambda text: None,
-    runner: Runner | None = None,
 ) -> Study:
     """Measure what the time allows for the material and generator of a recipe; stored measurements are kept
     and cost no time.
@@ -117,15 +101,13 @@ def run_study(
     seconds : time of the study
     command : for the page
     progress, announce : called with (share of the time spent, note), and with lines for the user
-    runner : measures; its workers on their machines and with their threads. This process by default
 
     Raises
     ------
     InputError : the folder holds something else, there is nothing to fit, or the disk is too small
-    PartialError : a worker died, or the disk is full; finished measurements are kept
+    PartialError : the disk is full; finished measurements are kept
     """
     start = time.perf_counter()
-    runner = runner or Runner()
 
     def spent() -> float:
         return time.perf_counter() - start
@@ -136,10 +118,7 @@ def run_study(
     job = Job.load(study_config(recipe.generate))
     config = job.config
     with owned(folder):
-        (there,) = runner.map(measuring_machine, [Item("machine")])
-        if there.error:
-            raise PartialError(f"no worker answers: {there.error}", hint=there.hint or RESUMES)
-        claim(folder, there.value)
+        claim(folder)
         conditions = Conditions.of(job, folder, GENERATOR * seconds)
         note("reference, which compiles the kernels")
         # Before anything is written: a refused study leaves the folder as it was.
@@ -151,14 +130,14 @@ def run_study(
             "seed": config.seed,
             "material": config.material,
             "date": time.strftime("%Y-%m-%d"),
-            "machine": there.value,
+            "machine": machine(),
         }
         STUDY.write(folder, description)
         write_document(folder / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
-        measurements = Measurements(conditions, MeasurementFolder(folder, conditions), runner, note)
+        measurements = Measurements(conditions, MeasurementFolder(folder, conditions), note)
         configurations = measurements.configurations
-        # Configurations take longer than their share where kernels are compiled; workers start anew.
-        until = COMPILING * generator_seconds(seconds) + (0.0 if runner.here else spent())
+        # Configurations take longer than their share where kernels are compiled.
+        until = COMPILING * generator_seconds(seconds)
 
         def missing() -> Iterator[Configuration]:
             for number, configuration in enumerate(configurations):
@@ -170,7 +149,7 @@ def run_study(
             spp = config.queries.spp
             measurements.recall_rate(spp)
             runs = measurements.plan_runs(seconds, spp)
-            size = disk_bytes(runs) * runner.workers
+            size = disk_bytes(runs)
             check_space(folder, size, "give a shorter --time, or choose another folder with -o")
             announce(expectation(seconds, size))
 

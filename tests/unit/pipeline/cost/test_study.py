@@ -1,12 +1,10 @@
-"""Cost studies: within their time, resumable, never mixed with others, on workers as in one process; fronts
-and what follows from them."""
+"""Cost studies: within their time, resumable, never mixed with others."""
 
 from __future__ import annotations
 
 import errno
 import math
 import os
-from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,8 +15,6 @@ from support.fake_runs import FakeRuns, MemoryStore, conditions, run
 from support.paths import ROOT
 
 from mbtf_core.errors import InputError, PartialError
-from mbtf_core.run.runner import Runner
-from mbtf_core.run.task import Item, Result, packed, run_task
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.cost import schedule
 from mbtf_pipeline.cost import study as module
@@ -58,37 +54,20 @@ def test_measurements_come_back_and_damaged_ones_are_repeated(tmp_path: Path) ->
     assert store.get(mesh) is None
 
 
-class Workers(Runner):
-    """Takes all items, and ends the last first."""
-
-    workers = 2
-    here = False
-
-    def map(self, function: Any, items: Iterable[Item], **options: Any) -> Iterator[Result]:  # type: ignore[override]
-        for item in reversed(list(items)):
-            yield Result(item.name, **run_task(*packed(function, item)))
-
-
-def test_workers_measure_the_runs_of_one_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whose errors follow from name and seed."""
-
+def test_a_run_that_fails_does_not_stop_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     def measure(self: Run, conditions: Conditions) -> Measurement:
         if self.name == "diverges":
             raise InputError("training diverged at step 7")
         spent = {"run_seconds": 24.0, "training_seconds": 5.0, "training_steps": 5000.0}
-        return point(5.0, 0.1 + 0.03 * self.seed + 0.01 * len(self.name), **spent)
+        return point(5.0, 0.1, **spent)
 
     monkeypatch.setattr(Run, "measure", measure)
     runs = [run(3000, "long", 9.0), run(2000, "one"), run(900, "diverges")]
     planned = [replace(run, seed=seed) for seed in range(2) for run in runs]
-    groups = []
-    for runner in (Runner(), Workers()):
-        found = Measurements(conditions(), MemoryStore(), runner)  # type: ignore[arg-type]
-        found.measure_runs(planned, lambda run: True)
-        groups.append([found.group(run) for run in runs])
-        assert found.failed[runs[2].label] == "training diverged at step 7"
-    assert groups[0] == groups[1]
-    assert [len(group) for group in groups[0]] == [2, 2, 0]
+    found = Measurements(conditions(), MemoryStore())  # type: ignore[arg-type]
+    found.measure_runs(planned, lambda run: True)
+    assert found.failed == {runs[2].label: "training diverged at step 7"}
+    assert [len(found.group(run)) for run in runs] == [2, 2, 0]
 
 
 RUNS = [run(3000, "long", 7200.0), run(2000, "short", 60.0), run(1000, "m", 40.0)]
