@@ -8,10 +8,8 @@ than on that of paths. Data and fits come from the generator and the fitter, cal
 
 from __future__ import annotations
 
-import os
 import shlex
 import shutil
-import socket
 import time
 import timeit
 from collections.abc import Sequence
@@ -101,7 +99,7 @@ class Run(Configuration):
         start = time.perf_counter()
         shards, generation_seconds = _generated(conditions, self.seed, (self.queries, self.spp), _NO_QUERIES)
         options = nested({"seed": conditions.config.seed + self.seed, **self.fit})
-        out = _own_folder(conditions) / f"fit-{data_sha256(self.key)[:12]}"
+        out = conditions.folder / f"fit-{data_sha256(self.key)[:12]}"
         shutil.rmtree(out, ignore_errors=True)
         result = fit(FitConfig.model_validate(options), shards, out)
         error = unexplained_variance(result.material.predict(test), test.value_a, test.value_b, test.weight)
@@ -183,11 +181,6 @@ def test_set(conditions: Conditions) -> ShardQueries:
     return found
 
 
-def _own_folder(conditions: Conditions) -> Path:
-    """This process's folder of temporary data and fits."""
-    return conditions.folder / f"{socket.gethostname()}-{os.getpid()}"
-
-
 def _generated(
     conditions: Conditions, seed: int, train: tuple[int, int], test: tuple[int, int]
 ) -> tuple[Path, float]:
@@ -195,7 +188,7 @@ def _generated(
     queries = {"train": str(train[0]), "spp": train[1], "test": str(test[0]), "test_spp": test[1]}
     changes = {"seed": conditions.config.seed + seed, "queries": {**queries, "layout": "shuffled"}}
     data = deep_merge(conditions.config.model_dump(mode="json"), changes)
-    folder = _own_folder(conditions) / f"data-{data_sha256(data)[:12]}"
+    folder = conditions.folder / f"data-{data_sha256(data)[:12]}"
     # Data that an interrupted study left behind were not timed.
     shutil.rmtree(folder, ignore_errors=True)
     start = time.perf_counter()
