@@ -51,12 +51,6 @@ def format_duration(seconds: float) -> str:
     return _format(seconds, _SECONDS, "s")
 
 
-def rounded_duration(seconds: float) -> str:
-    """A duration, rounded up to ten seconds, or to minutes."""
-    unit = 10.0 if seconds < 300.0 else 60.0
-    return format_duration(unit * math.ceil(seconds / unit))
-
-
 def parse_size(text: str | float) -> float:
     """Bytes of ``"500MB"``, ``"4GB"``, or of a plain number of bytes, decimal units; a ValueError for others,
     and for those not positive."""

@@ -159,8 +159,7 @@ class TrainingSection(Settings):
         None,
         gt=0,
         le=1,
-        description="unexplained variance at which training stops: validation error plus its standard "
-        "error; a cost study forecasts the time",
+        description="unexplained variance at which training stops: validation error plus its standard error",
     )
     batch: Annotated[int, Flag("--batch", rare=True)] = Field(
         1 << 15, ge=1, le=1 << 24, description="queries per step"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,8 +20,8 @@ from mbtf_pipeline.stages import RUN
 _START, _COMPARE = 2.5, 5.0
 # Bytes of a pixel of a reference and of a fit's image.
 _REFERENCE_BYTES, _FIT_BYTES = 70, 30
-# Seconds of starting, of a path and of a training step where no pilot was run: those of a slow machine.
-_SLOW, _SLOW_STEP = (0.0, 2e-6), 0.1
+# Seconds of starting and of a path where no pilot was run: those of a slow machine.
+_SLOW = (0.0, 2e-6)
 
 
 @dataclass(frozen=True)
@@ -114,10 +114,10 @@ class RunForecaster:
         )
 
 
-def forecast_left(recipe: Recipe, folder: Path, draft: Callable[[], Recipe]) -> str | None:
-    """Forecast of the stages that a run in a folder has yet to do, as a line that names the draft, made by
-    `draft`, where it is faster. None where they are short and small on any machine; an InputError where they
-    do not fit on the disk, or the folder contains something else."""
+def forecast_left(recipe: Recipe, folder: Path) -> str | None:
+    """Forecast of the stages that a run in a folder has yet to do, in one line. None where they are short and
+    small on any machine; an InputError where they do not fit on the disk, or the folder contains something
+    else."""
     RUN.check(folder)
     stages = [name for name, reason in survey(recipe, folder).items() if reason]
     forecaster = RunForecaster(recipe)
@@ -126,8 +126,4 @@ def forecast_left(recipe: Recipe, folder: Path, draft: Callable[[], Recipe]) -> 
     check_space(folder, expected.bytes, hint)
     if not is_long(expected.seconds, expected.bytes):
         return None
-    shorter = draft()
-    expected, other = forecaster.of(recipe, stages), forecaster.of(shorter)
-    training = max(other.training, other.min_steps * _SLOW_STEP * len(shorter.fit))
-    faster = other.seconds - other.training + training < expected.seconds
-    return expected.describe() + "; faster: --quality draft" * faster
+    return forecaster.of(recipe, stages).describe()

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from mbtf_core.app.options import Quality
 from mbtf_core.color import ALBEDO_EXPOSURE
-from mbtf_core.config.settings import Settings, build, deep_merge, distinct, explicit_options, resolve
+from mbtf_core.config.settings import Settings, build, distinct, explicit_options, resolve
 from mbtf_core.config.yaml_file import dump_yaml, line_of, read_yaml
 from mbtf_core.errors import InputError
 from mbtf_core.paths import named_file, split_url
@@ -274,13 +274,6 @@ def preset_recipe(path: Path, quality: Quality | None, assignments: Sequence[str
     from mbtf_gen.job import Job, limit_resolution
 
     return recipe.model_copy(update={"generate": limit_resolution(Job.load(recipe.generate)).config})
-
-
-def with_error(recipe: Recipe, error: float) -> Recipe:
-    """The recipe with an error at which the training of each fit stops."""
-    changes = {"training": {"error": error}}
-    fits = {n: FitConfig.model_validate(deep_merge(f.model_dump(), changes)) for n, f in recipe.fit.items()}
-    return recipe.model_copy(update={"fit": fits})
 
 
 def write_recipe(recipe: Recipe, folder: Path, *, overwrite: bool = False) -> None:

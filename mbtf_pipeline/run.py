@@ -44,7 +44,6 @@ from mbtf_pipeline.stages import (
 
 if TYPE_CHECKING:
     from mbtf_core.data.schema import Layout
-    from mbtf_fit.viewer.live import LiveView
 
 GENERATE_STAGE, COMPARE_STAGE, REPORT_STAGE = "generate", "compare", "report"
 
@@ -118,7 +117,6 @@ class _RecipeRun:
     recipe: Recipe
     folder: Path
     console: Console
-    live: LiveView | None = None
     runner: Runner = field(default_factory=Runner)
 
     def stages(self, inputs: Mapping[str, str]) -> list[Stage]:
@@ -201,7 +199,6 @@ class _RecipeRun:
                 progress=lambda phase, share, note: bar.update(
                     round(100 * share, 1), note, label=f"{fit_stage(name)} {phase}"
                 ),
-                observe=None if self.live is None else self.live.observer(name),
             )
         return done.seconds
 
@@ -216,25 +213,13 @@ class _RecipeRun:
             compare(recipe.compare, recipe.generate, shards, fits, out, advance, self.runner)
 
     def show(self, stage: str, decision: Decision, seconds: float | None) -> None:
-        """Say a stage's state, and show what it has made."""
+        """Say a stage's state."""
         if seconds is None:
             state = f"running ({decision.reason})" if decision.reason else "up to date"
         else:
             state = f"finished in {clock(seconds)}"
         if decision.reason or seconds is None:
             self.console.note(f"{stage}: {state}")
-        if self.live is None:
-            return
-        self.live.stage(stage, state)
-        if seconds is None:
-            return
-        name = stage.removeprefix(fit_stage(""))
-        if name != stage:
-            self.live.finished(name, self.folder / FITS / name)
-        elif stage == COMPARE_STAGE:
-            from mbtf_pipeline.report.report import run_pictures
-
-            self.live.pictures(run_pictures(self.folder))
 
     def _report(self, decision: Decision) -> None:
         from mbtf_pipeline.report.report import write_report, write_viewer
@@ -299,7 +284,6 @@ def run_recipe(
     force: bool = False,
     command: str = "",
     console: Console | None = None,
-    live: LiveView | None = None,
     runner: Runner | None = None,
 ) -> RunResult:
     """Run a recipe; stages whose inputs have not changed are skipped.
@@ -316,8 +300,6 @@ def run_recipe(
         Command that the report shows for reproduction.
     console : Console, optional
         Receives progress; quiet by default.
-    live : LiveView, optional
-        Shows stages and fits as they come.
     runner : Runner, optional
         Renders shards and reference pictures and trains the fits; in this process by default.
 
@@ -334,7 +316,7 @@ def run_recipe(
         Another process uses the folder, or the disk is full; the same command resumes the run.
     """
     folder = recipe.folder if folder is None else folder
-    run = _RecipeRun(recipe, folder, console or Console(quiet=True), live, runner or Runner())
+    run = _RecipeRun(recipe, folder, console or Console(quiet=True), runner or Runner())
     with _claimed(recipe, folder, command, force):
         results = run_stages(folder, run.stages(_material_inputs(recipe)), force=force, notify=run.show)
     viewer, comparison = folder / VIEWER, read_json(folder / COMPARE / COMPARISON_NAME)

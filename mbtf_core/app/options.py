@@ -70,23 +70,6 @@ MovedMaterial = Annotated[
     Parameter(name="--material", metavar="PATH", help="Path of the material, if it was moved."),
 ]
 Overwrite = Annotated[Switch, Parameter(help="Replace existing output.")]
-ErrorOption = Annotated[
-    float | None,
-    Parameter(
-        name="--error",
-        metavar="FLOAT",
-        help="Unexplained variance at which training stops: validation error plus its standard error; "
-        "a cost study forecasts the time.",
-    ),
-]
-
-
-def check_error(error: float | None) -> None:
-    """Refuse an ``--error`` that is no unexplained variance in (0, 1], below that of the mean value."""
-    if error is not None and not 0 < error <= 1:
-        raise UsageError("must be above 0 and at most 1, the error of the mean value", where="--error")
-
-
 ClusterOption = Annotated[
     str | None,
     Parameter(

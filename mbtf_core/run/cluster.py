@@ -133,7 +133,6 @@ class DaskRunner(Runner):
         items: Iterable[Item],
         *,
         independent: bool = False,
-        ahead: int | None = None,
     ) -> Generator[Result]:
         """As of the base class, in no particular order.
 
@@ -143,7 +142,6 @@ class DaskRunner(Runner):
         """
         distributed = import_extra("distributed", "--cluster")
         run, waiting = uuid4().hex[:8], iter(items)
-        most = _AHEAD if ahead is None else ahead
         pending: dict[str, Item] = {}
         done = distributed.as_completed(loop=self._client.loop)
         locked: deque[tuple[float, Item]] = deque()
@@ -168,7 +166,7 @@ class DaskRunner(Runner):
                 while locked and (locked[0][0] <= time.monotonic() or not pending):
                     time.sleep(max(0.0, locked[0][0] - time.monotonic()))
                     submit(locked.popleft()[1])
-                while len(pending) < most + 2 * self.workers and (item := next(waiting, None)) is not None:
+                while len(pending) < _AHEAD + 2 * self.workers and (item := next(waiting, None)) is not None:
                     submit(item)
                 if not pending:
                     return

@@ -195,7 +195,6 @@ class Processes(Runner):
         items: Iterable[Item],
         *,
         independent: bool = False,
-        ahead: int | None = None,
     ) -> Generator[Result]:
         """As of the base class."""
         free: SimpleQueue[int] = SimpleQueue()

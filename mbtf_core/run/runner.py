@@ -38,7 +38,6 @@ class Runner:
         items: Iterable[Item],
         *,
         independent: bool = False,
-        ahead: int | None = None,
     ) -> Generator[Result]:
         """Call a function for every item; yields each result as it comes.
 
@@ -47,7 +46,6 @@ class Runner:
         function : of a module; see :mod:`mbtf_core.run.task`
         items : read as workers become free
         independent : a failure that concerns files or options says nothing about the other items
-        ahead : items that are read before workers are free for them, beyond two for each worker
 
         Raises
         ------

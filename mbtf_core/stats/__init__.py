@@ -12,7 +12,6 @@ from mbtf_core.stats.estimate import (
     mean_estimate,
     t_test,
 )
-from mbtf_core.stats.learning_curve import Interval, LearningCurve
 from mbtf_core.stats.paired import (
     local_error,
     mean_of_halves,
@@ -28,8 +27,6 @@ from mbtf_core.stats.paired import (
 
 __all__ = [
     "Estimate",
-    "Interval",
-    "LearningCurve",
     "Outcome",
     "by_group",
     "elevation_groups",

@@ -1,8 +1,7 @@
-"""The next command after a fit or its evaluation."""
+"""Advice after a fit or its evaluation."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -27,26 +26,18 @@ def suggest(material: Material, history: list[dict[str, Any]], errors: dict[str,
 
 def advise(
     material: Material,
-    folder: Path,
-    shards: Path | DataFolder,
+    shards: DataFolder,
     history: list[dict[str, Any]],
     errors: dict[str, Any],
-) -> tuple[str | None, list[str]]:
-    """What reduces the error of a fit in a folder most: the command, and the lines that say why; neither
-    where :func:`suggest` has none. `errors` by split are those on the data set `shards`; where these are
-    other test queries of the training data, the errors of its other splits are those of the fit."""
+) -> str | None:
+    """One line on what reduces the error of a fit most, by its errors on a data set; None where
+    :func:`suggest` has none."""
     from mbtf_core.data.dataset import Dataset
-    from mbtf_fit.training.fit_folder import configuration_digest, training_digest
+    from mbtf_fit.training.fit_folder import training_digest
 
-    training, data, train = material.description["training"], Dataset.open(shards), None
-    is_other = training["shards_sha256"] != training_digest(data)
-    known = training.get("data_sha256")
-    if is_other and known is not None and known == configuration_digest(data) and "test" in errors:
-        errors, train = {**training["errors"], "test": errors["test"]}, training["data_queries"]
     step = suggest(material, history, errors)
     if step is None:
-        return None, []
-    if is_other and train is None:
-        return None, ["the fit had other training data; evaluate it on them for advice"]
-    command = step.command(material.config, training["seconds"], data, folder, train)
-    return command, [step.reason if command is None else f"{step.reason}:\n  {command}"]
+        return None
+    if material.description["training"]["shards_sha256"] != training_digest(Dataset.open(shards)):
+        return "the fit had other training data; evaluate it on them for advice"
+    return step.reason

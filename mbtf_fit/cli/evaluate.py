@@ -53,12 +53,12 @@ def evaluate(
         )
     found = evaluate(loaded, folder)
     history = [] if foreign else read_history(material)
-    command, advice = advise(loaded, material, folder, history, found["errors"])
+    advice = advise(loaded, folder, history, found["errors"])
     lines = [
         f"{material}: {loaded.model.name} on {folder}",
         *report_errors(found["errors"], found.get("transmittance"), verbose, foreign=bool(foreign)),
-        *advice,
+        *([] if advice is None else [advice]),
     ]
     report = {"material": material, "shards": shards, "foreign_inputs": foreign, **found}
-    report["next_command"] = command
+    report["advice"] = advice
     console.report(report, "\n".join(lines))

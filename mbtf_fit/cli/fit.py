@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext, suppress
-from dataclasses import asdict
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +13,6 @@ from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.help import MORE
 from mbtf_core.app.options import (
     ClusterOption,
-    DryRun,
     Options,
     Output,
     Overwrite,
@@ -23,14 +21,12 @@ from mbtf_core.app.options import (
     Switch,
     Verbose,
     options_from,
-    whole_number,
 )
 from mbtf_core.app.progress import Progress
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import expectation
 from mbtf_fit.cli.advice import advise
-from mbtf_fit.cli.live import Live, live_view
 from mbtf_fit.config import DEFAULT_MODEL, FitConfig, ModelName, best_model
 from mbtf_fit.formatting import describe_fit, fits_table
 
@@ -51,14 +47,8 @@ def fit(
     quality: QualityOption = None,
     options: FitOptions = FitOptions(),  # noqa: B008
     many: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
-    processes: Annotated[
-        int | None, Parameter(converter=whole_number, show_default="one per GPU, or 1", group=MORE)
-    ] = None,
     shared_decoder: Annotated[Switch, Parameter(group=MORE)] = False,
-    live: Live = False,
-    tensorboard: Annotated[Path | None, Parameter(metavar="FOLDER", group=MORE)] = None,
     cluster: ClusterOption = None,
-    dry_run: DryRun = False,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
     console: Console = CONSOLE,
@@ -68,8 +58,7 @@ def fit(
     The same command again resumes an unfinished fit. --time is that of training; the first line says about
     how long reading, calibration and errors take beside it. Errors, the validation error too, are those of
     test queries, which no fit is trained on. --quality trains 800 steps at least, even if they take longer,
-    as does --time "12s, at least 800 steps". --dry-run forecasts time and size by some seconds of training on
-    this machine. With --many, the output folder holds one folder per material.
+    as does --time "12s, at least 800 steps". With --many, the output folder holds one folder per material.
 
     Parameters
     ----------
@@ -78,23 +67,13 @@ def fit(
     many
         Fit several data sets, one material each: folders made by mbtf-gen, or folders of such folders. A fit
         that fails does not stop the others.
-    processes
-        With --many, number of simultaneous fits.
     shared_decoder
         With --many, fit all data sets together with one network. --time is that of all of them.
-    tensorboard
-        Write the curves of the fit as event files for TensorBoard to a folder.
     """
     for refused, what, hint in (
         (many is not None and shards is not None, "--many replaces the argument SHARDS", "leave out one"),
-        (many is not None and dry_run, "--dry-run takes one data set", "mbtf-fit shards/ --dry-run"),
-        (many is not None and live, "--live shows one fit", "leave out --many, or --live"),
-        (many is not None and bool(tensorboard), "--tensorboard shows one fit", "leave out one of them"),
         (many is None and shared_decoder, "--shared-decoder requires --many", "mbtf-fit --many a/ b/ ..."),
-        (many is None and processes is not None, "--processes requires --many", "mbtf-fit --many a/ b/ ..."),
         (many is None and cluster is not None, "--cluster requires --many", "mbtf-fit --many a/ b/ ..."),
-        (bool(processes) and cluster is not None, "--cluster sets the processes", "leave out --processes"),
-        (processes is not None and processes < 1, "--processes must be positive", ""),
     ):
         if refused:
             raise UsageError(what, hint=hint)
@@ -103,7 +82,7 @@ def fit(
             options = options.assigning("training.shared_decoder=true")
         made = not output.exists()
         try:
-            _fit_many(options, quality, many, output, processes, cluster, overwrite, console)
+            _fit_many(options, quality, many, output, cluster, overwrite, console)
         finally:
             # It is empty where every fit failed at once.
             with suppress(OSError):
@@ -116,64 +95,40 @@ def fit(
 
     folder = DataFolder.open(shards)
     config = resolve_config(options, quality, folder)
-    if not dry_run:
-        _fit_one(config, folder, output, live, tensorboard, overwrite, verbose, console)
-        return
-    from mbtf_fit.training.forecast import forecast_fit
-
-    expected = forecast_fit(config, folder)
-    data = {"shards": str(folder), "model": config.model, "forecast": asdict(expected)}
-    console.report(data, expected.describe())
+    _fit_one(config, folder, output, overwrite, verbose, console)
 
 
 def _fit_one(
     config: FitConfig,
     shards: DataFolder,
     output: Path,
-    live: bool,
-    tensorboard: Path | None,
     overwrite: bool,
     verbose: bool,
     console: Console,
 ) -> None:
-    """Fit a data set, watched by whoever asks for it."""
+    """Fit a data set, and report."""
     from mbtf_fit.material.format import DESCRIPTION_NAME
     from mbtf_fit.training.endings import describe_ending, describe_kept
     from mbtf_fit.training.fit import fit
-    from mbtf_fit.training.fit_folder import EventLog
 
     finished = not overwrite and (output / DESCRIPTION_NAME).exists()
     if not finished:
         _announce(config, [shards], output, f"{shards} -> {output}: {config.model}", console)
-    with (
-        nullcontext() if tensorboard is None else EventLog(tensorboard) as log,
-        live_view(str(output), live, console) as shown,
-        console.progress(total=100, label="reading", unit="%") as bar,
-    ):
-        curves = None if shown is None else shown.observer(output.name)
-        observers = [observer for observer in (curves, log) if observer is not None]
-
-        def observe(*validation: Any) -> None:
-            for observer in observers:
-                observer(*validation)
-
+    with console.progress(total=100, label="reading", unit="%") as bar:
         result = fit(
             config,
             shards,
             output,
             overwrite=overwrite,
             progress=_training_progress(bar, output),
-            observe=observe if observers else None,
         )
-        if shown is not None:
-            shown.finished(output.name, output)
     if finished:
         console.note(f"{output}: this fit is already finished; --overwrite trains it again")
-    command, advice = advise(result.material, output, shards, result.history, result.errors)
-    summary = {**result.as_dict(), "next_command": command}
+    advice = advise(result.material, shards, result.history, result.errors)
+    summary = {**result.as_dict(), "advice": advice}
     ending = describe_ending(config, result.history)
     kept = describe_kept(result.history, result.kept_step)
-    more = [*(line for line in (kept, ending) if line is not None), *advice]
+    more = [line for line in (kept, ending, advice) if line is not None]
     console.report(summary, "\n".join([describe_fit(summary, verbose), *more]))
 
 
@@ -260,7 +215,6 @@ def _fit_many(
     quality: Quality | None,
     many: list[Path],
     output: Path,
-    processes: int | None,
     cluster: str | None,
     overwrite: bool,
     console: Console,
@@ -273,11 +227,10 @@ def _fit_many(
     config = resolve_config(options, quality, *shards)
     if not config.training.shared_decoder:
         configs = [resolve_config(options, quality, folder) for folder in shards]
-        _fit_each(configs, shards, folders, output, processes, cluster, overwrite, console)
+        _fit_each(configs, shards, folders, output, cluster, overwrite, console)
         return
-    if processes is not None or cluster is not None:
-        flag = "--cluster" if processes is None else "--processes"
-        raise UsageError(f"a shared network is one fit: leave out {flag}")
+    if cluster is not None:
+        raise UsageError("a shared network is one fit: leave out --cluster")
     from mbtf_fit.training.endings import describe_kept
     from mbtf_fit.training.fit import fit_jointly
 
@@ -308,20 +261,18 @@ def _fit_each(
     shards: Sequence[Path],
     folders: Sequence[Path],
     output: Path,
-    processes: int | None,
     cluster: str | None,
     overwrite: bool,
     console: Console,
 ) -> None:
-    """Fit several data sets, in processes of their own or on a cluster."""
+    """Fit several data sets, in processes of their own, one per GPU at a time, or on a cluster."""
+    import torch
+
     from mbtf_core.run.cluster import open_runner
     from mbtf_core.run.processes import Processes
     from mbtf_fit.training.fit_many import fit_many
 
-    if processes is None:
-        import torch
-
-        processes = max(1, torch.cuda.device_count()) if configs[0].device != "cpu" else 1
+    processes = max(1, torch.cuda.device_count()) if configs[0].device != "cpu" else 1
     models = " and ".join(sorted({config.model for config in configs}))
     console.note(f"{len(shards)} data sets -> {output}: {models}")
     keep_on_interruption(f"finished fits and the last checkpoints are kept in {output}")

@@ -19,7 +19,7 @@ from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.format import DEFAULT_MIN_COS
 from mbtf_fit.material.material import export
 from mbtf_fit.material.transmittance import evaluate_transmittance, fit_transmittance
-from mbtf_fit.training.fit_folder import configuration_digest, training_digest
+from mbtf_fit.training.fit_folder import training_digest
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.sampler import distill
 from mbtf_fit.training.trainer import Trainer, TrainingProgress
@@ -90,9 +90,6 @@ def export_fit(
         "queries": len(partition.training),
         "queries_per_texel": density,
         "shards_sha256": training_digest(data),
-        # Data of other test queries, but of this configuration, measure the error of this fit.
-        "data_sha256": configuration_digest(data),
-        "data_queries": ((data.manifest.get("config") or {}).get("queries") or {}).get("train"),
         "loss": trainer.progress.loss,
         "validation_set": validated,
         "regularization": asdict(trainer.regularization),

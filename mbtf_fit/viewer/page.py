@@ -42,7 +42,6 @@ _SCRIPTS = (
     "viewer.js",
     "panel.js",
     "pointer.js",
-    "live.js",
     "main.js",
 )
 
@@ -57,7 +56,7 @@ def safe_json(content: Any) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def write_page(content: Mapping[str, Any], title: str, *, live: bool = False) -> str:
+def write_page(content: Mapping[str, Any], title: str) -> str:
     """HTML of the viewer.
 
     Parameters
@@ -65,7 +64,6 @@ def write_page(content: Mapping[str, Any], title: str, *, live: bool = False) ->
     content : ``materials``, and optionally ``poster``, ``pictures``, ``mesh`` and ``environment``
         (:mod:`mbtf_fit.viewer.page`, :mod:`mbtf_fit.viewer.extras`)
     title : shown by the browser
-    live : whether the page may connect to the server that sent it
     """
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     names = sorted(file.name for file in files(__package__).joinpath("page").iterdir())
@@ -76,7 +74,6 @@ def write_page(content: Mapping[str, Any], title: str, *, live: bool = False) ->
     # Our own files: nothing in them is escaped.
     return environment.from_string(_read("viewer.html")).render(
         title=title,
-        connect=Markup("'self'" if live else "'none'"),
         style=Markup(_read("viewer.css")),
         content=Markup(safe_json({**content, "shaders": shaders})),
         script=Markup(script + "\n".join(_read(name) for name in _SCRIPTS)),
@@ -124,14 +121,13 @@ def _moments(layout: Layout, texels: F32) -> list[tuple[F32, F32, bool]]:
     return []
 
 
-def pack_textures(material: Material, bits: int = 8, effort: int = 9) -> dict[str, PackedTexture]:
+def pack_textures(material: Material, bits: int = 8) -> dict[str, PackedTexture]:
     """All textures by name, with so many bits per number; heights have 12."""
     images = program_of(material, GLSL).images
     return {
         image.source: pack(
             _rounded(image),
             12 if image.layout == "nodes" else bits,
-            effort,
             alike=image.layout == "horizons",
         )
         for image in images

@@ -49,14 +49,13 @@ def predicted(values: NDArray[np.int64]) -> NDArray[np.int64]:
     return out
 
 
-def pack(levels: Sequence[F32], bits: int = 8, effort: int = 9, *, alike: bool = False) -> PackedTexture:
+def pack(levels: Sequence[F32], bits: int = 8, *, alike: bool = False) -> PackedTexture:
     """Quantize and compress a texture.
 
     Parameters
     ----------
     levels : (rows, columns, channels) arrays, coarsest first
     bits : per number, up to 16
-    effort : of the compression, 1 to 9
     alike : whether neighboring channels are alike
 
     Raises
@@ -85,7 +84,7 @@ def pack(levels: Sequence[F32], bits: int = 8, effort: int = 9, *, alike: bool =
     numbers = np.concatenate(stored)
     parts = [numbers & 255, *([numbers >> 8] if bits > 8 else [])]
     # The strategy for data whose small numbers are frequent.
-    coder = zlib.compressobj(effort, strategy=zlib.Z_FILTERED)
+    coder = zlib.compressobj(9, strategy=zlib.Z_FILTERED)
     stream = coder.compress(b"".join(part.astype(np.uint8).tobytes() for part in parts)) + coder.flush()
     description = {
         "shapes": [list(texels.shape[:2]) for texels in levels],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mbtf_core.app.console import CONSOLE, Console, new_app
-from mbtf_gen.cli.exchange import export, import_measured, publish
+from mbtf_gen.cli.exchange import import_measured, publish
 from mbtf_gen.cli.folders import merge, repair, verify
 from mbtf_gen.cli.generate import generate
 from mbtf_gen.cli.material import inspect, plan
@@ -44,5 +44,4 @@ app.default(generate)
 for command in (inspect, plan, preview, merge, verify, repair, reference, selftest, doctor):
     app.command(command)
 app.command(import_measured, name="import")
-app.command(export)
 app.command(publish)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
-from pathlib import Path
-from typing import Annotated, Any
+from dataclasses import asdict
+from typing import Annotated
 
 from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import Options, Overwrite, PathText, QualityOption, options_from
-from mbtf_core.errors import InputError, UsageError
+from mbtf_core.app.options import Options, PathText, QualityOption, options_from
+from mbtf_core.errors import UsageError
 from mbtf_core.paths import split_url
 from mbtf_gen.cli.generate import GenerateOptions, prepare_job, resolve_config
 from mbtf_gen.config.generator import GeneratorConfig
@@ -26,8 +25,6 @@ def inspect(
     /,
     *,
     options: InspectOptions = InspectOptions(),  # noqa: B008
-    write: Annotated[Path | None, Parameter(metavar="FILE")] = None,
-    overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
     """Describe a material and each of its maps.
@@ -38,29 +35,16 @@ def inspect(
     ----------
     material
         Height map, folder of maps, material.yaml, mesh, yarns or fibers.
-    write
-        Store the height scale, tiling, resolution, normal convention and color space in a material.yaml, as
-        given or as the maps suggest. Other commands then need no flags.
     """
     if split_url(material) is not None:
         hint = f"describe a data set with: mbtf-fit info {material}"
         raise UsageError("is a URL, but materials are local files", where=material, hint=hint)
     resolved = resolve_config(options, material)
-    _check_new(write, overwrite)
-    from mbtf_gen.tile.choices import write_material_file
     from mbtf_gen.tile.inspection import inspection_text
     from mbtf_gen.tile.loading import load_material
 
-    geometry, finest = resolved.geometry, resolved.queries.finest
+    geometry = resolved.geometry
     loaded = load_material(resolved.material, geometry.make_tileable, geometry.max_pixels)
-    outputs: dict[str, Any] = {}
-    if write is not None:
-        choices = write_material_file(write, loaded, resolved)
-        outputs["written"] = {"file": write, "choices": {name: asdict(c) for name, c in choices.items()}}
-        # What follows describes the material as other commands will use it.
-        written = load_material(write, max_pixels=geometry.max_pixels)
-        loaded, finest = replace(written, unused=loaded.unused), None
-        geometry = geometry.model_copy(update={"height_scale": None})
     if loaded.bsdf_type is not None:
         from mbtf_gen.engine.runtime import load_mitsuba
 
@@ -69,20 +53,8 @@ def inspect(
 
         # Mitsuba refuses what it does not know.
         load_surface(loaded.surface(()))
-    described = loaded.inspect(geometry, finest)
-    found = {"material": resolved.material, **described, **outputs}
+    found = {"material": resolved.material, **loaded.inspect(geometry, resolved.queries.finest)}
     console.report(found, inspection_text(found, resolved.material))
-
-
-def _check_new(path: Path | None, overwrite: bool) -> None:
-    """Refuse a material file of another suffix, or one that exists."""
-    if path is None:
-        return
-    if path.suffix.lower() not in (".yaml", ".yml"):
-        raise UsageError(f"'{path}' must end in .yaml or .yml", where="--write")
-    if path.exists() and not (overwrite and path.is_file()):
-        hint = "--overwrite replaces it" if path.is_file() else "name a file"
-        raise InputError("exists already", where=path, hint=hint)
 
 
 def plan(

@@ -1,4 +1,4 @@
-"""``mbtf-gen preview`` and ``mbtf-gen reference``: pictures of a material and of its queries."""
+"""``mbtf-gen preview`` and ``mbtf-gen reference``: pictures of a material."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ from mbtf_core.app.options import ClusterOption, Options, Output, Overwrite, Pat
 from mbtf_gen.cli.generate import resolve_config
 from mbtf_gen.config.pictures import RENDERING, PreviewConfig, ReferenceConfig
 
-_QUERIES = ("train", "resolution", "min_cos", "layout", "patch_size")
 
-
-@options_from(PreviewConfig, "preview", "exposure", *(f"queries.{key}" for key in _QUERIES), *RENDERING)
+@options_from(PreviewConfig, "preview", "exposure", *RENDERING)
 class PreviewOptions(Options[PreviewConfig]):
     """Options of ``mbtf-gen preview``."""
 
@@ -26,9 +24,7 @@ def preview(
     overwrite: Overwrite = False,
     console: Console = CONSOLE,
 ) -> None:
-    """Draw the mesh, a path-traced picture, and the queries.
-
-    Yarns and fibers have no mesh: they are drawn in the path-traced picture alone.
+    """Draw a path-traced picture of the plane: beauty.png.
 
     Parameters
     ----------

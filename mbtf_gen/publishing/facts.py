@@ -20,7 +20,6 @@ from mbtf_core.data.shard_files import Arrays
 from mbtf_core.files.atomic import Stored
 from mbtf_core.stats import Estimate, mean_estimate, pooled_relative_error
 from mbtf_gen.config.exchange import PublishConfig
-from mbtf_gen.measured.exported import mean_of
 
 TAGS = (
     *("btf", "mbtf", "brdf", "reflectance", "appearance", "material", "rendering", "computer-graphics"),
@@ -108,6 +107,12 @@ class Facts:
         if "value_b" not in arrays:
             return None
         return pooled_relative_error(arrays["value_a"], arrays["value_b"], _weight(arrays))
+
+
+def mean_of(arrays: Arrays) -> NDArray[np.float32]:
+    """Values (..., 3): the mean of both estimates, or the only one."""
+    first = arrays["value_a"]
+    return np.float32(0.5) * first + np.float32(0.5) * arrays.get("value_b", first)
 
 
 def _weight(arrays: Arrays) -> NDArray[np.float32] | None:

@@ -1,7 +1,7 @@
 """The picture of a card: the tile, its apparent BRDF and its heights, drawn from the stored numbers alone.
 
 Queries lie uniformly on the tile. Averages over all positions are therefore the tile mean, and those over
-directions are pictures of the tile; where the heights are known, without parallax. Nothing is rendered.
+directions from above are pictures of the tile. Nothing is rendered.
 """
 
 from __future__ import annotations
@@ -17,22 +17,20 @@ from mbtf_core.color import ALBEDO_EXPOSURE, to_display
 from mbtf_core.data.geometry import Geometry
 from mbtf_core.data.shard_files import Arrays
 from mbtf_core.files.atomic import Stored, write_chunks
-from mbtf_gen.measured.exported import mean_of
+from mbtf_gen.publishing.facts import mean_of
 
 F64 = NDArray[np.float64]
 PICTURE_NAME = "contact_sheet.png"
 # Elevations of the lights of the BRDF, in degrees.
 _ELEVATIONS = (35.0, 65.0)
-# Smallest cosine of views in the picture of the tile; without heights, parallax blurs it.
-_WITH_HEIGHTS, _FROM_ABOVE = 0.35, 0.85
+# Smallest cosine of views in the picture of the tile: parallax would blur it.
+_FROM_ABOVE = 0.85
 # Pixels across a panel, queries that its smoothing averages, its largest standard deviation in tile widths.
 _ACROSS, _PER_WINDOW, _WIDEST = 192, 32, 0.1
 # Share of the queries, those with the finest footprints, that is shown at least.
 _FINEST = 0.2
 # Queries per pixel of the BRDF, and pixels across at least and at most.
 _PER_PIXEL, _LEAST, _MOST = 48, 4, 128
-# Steps along a view ray, from the reference plane to the lowest height.
-_STEPS = 48
 # What is shown where there is no query.
 _EMPTY = 238
 
@@ -46,8 +44,8 @@ def mean_image(x: F64, y: F64, value: F64, rows: int, columns: int) -> F64:
     return np.moveaxis(np.asarray(found), 0, -1)
 
 
-def tile_image(arrays: Arrays, aspect: float, geometry: Geometry | None) -> F64:
-    """Mean value by visible position, under all lights.
+def tile_image(arrays: Arrays, aspect: float) -> F64:
+    """Mean value by position as seen from above, under all lights.
 
     An image (rows, columns, 3) in 1/sr, row 0 at ``v → 1``, of a tile of this height over its width, smoothed
     as wide as few queries require; NaN where there are none. Values over white and over 99% of the others are
@@ -56,27 +54,8 @@ def tile_image(arrays: Arrays, aspect: float, geometry: Geometry | None) -> F64:
     u, _, view, value = _queries(arrays)
     value = np.minimum(value, max(2.0**-ALBEDO_EXPOSURE, np.quantile(value, 0.99, axis=0).max()))
     sigma = np.asarray(arrays["sigma"], np.float64).reshape(-1)
-    found = view[:, 2] > (_FROM_ABOVE if geometry is None else _WITH_HEIGHTS)
-    if geometry is not None:
-        u[found] = visible_positions(u[found], view[found], geometry)
+    found = view[:, 2] > _FROM_ABOVE
     return _smoothed(u[found], sigma[found], value[found], aspect)
-
-
-def visible_positions(u: F64, view: F64, geometry: Geometry) -> F64:
-    """Positions (n, 2) in [0, 1)² where view rays through positions u of the reference plane meet heights, to
-    a 48th of their range."""
-    rows, columns = geometry.heights.shape
-    step = -float(geometry.heights.min()) / _STEPS
-    # Per unit of depth, in the coordinates of u.
-    slope = -view[:, :2] / view[:, 2:] / (1.0, geometry.aspect)
-    at, left = u.copy(), np.arange(len(u))
-    for number in range(1, _STEPS + 1):
-        x, y = at[left].T
-        row = np.floor((1.0 - y) * rows).astype(int) % rows
-        below = geometry.heights[row, np.floor(x * columns).astype(int) % columns] < -number * step
-        left = left[below]
-        at[left] += step * slope[left]
-    return np.asarray(at % 1.0)
 
 
 def _smoothed(u: F64, sigma: F64, value: F64, aspect: float) -> F64:
@@ -138,7 +117,7 @@ def write_picture(arrays: Arrays, aspect: float, geometry: Geometry | None, path
     from matplotlib.figure import Figure
 
     panels = [
-        ("the tile, all lights", tile_image(arrays, aspect, geometry), (0, 1, 0, aspect)),
+        ("the tile, all lights", tile_image(arrays, aspect), (0, 1, 0, aspect)),
         ("apparent BRDF by ω_o", brdf_image(arrays), (-1, 1, -1, 1)),
     ]
     figure = Figure(figsize=(3.0 * (len(panels) + (geometry is not None)), 3.3), layout="constrained")

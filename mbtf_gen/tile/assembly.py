@@ -23,9 +23,9 @@ from mbtf_gen.tile.maps.checks import (
     choose_convention,
     coarse_step,
     code_use,
+    inversion_warning,
     level_warning,
     normal_note,
-    orientation_warning,
     refuse_color,
     seam_warning,
 )
@@ -148,8 +148,7 @@ def _normals(
     path = load.files["normal"]
     fit = fit_normals(height, vectors)
     convention, how, warning = choose_convention(fit, normal_convention(path.name), entry.convention, path)
-    misfit = None if fit is None else orientation_warning(fit, path, load.files["height"])
-    load.warnings += filter(None, (warning, misfit))
+    load.warnings += filter(None, (warning, inversion_warning(fit, path)))
     load.notes.append(normal_note(path, fit, convention, how))
     load.settings["normal"] = convention
     green = np.array([1.0, 1.0 if convention == "gl" else -1.0, 1.0], np.float32)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -10,14 +9,9 @@ from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import (
-    ClusterOption,
-    DryRun,
-    ErrorOption,
     Output,
     Set,
-    check_error,
     command_line,
-    whole_number,
 )
 from mbtf_core.errors import UsageError
 
@@ -28,18 +22,13 @@ def cost(
     *,
     output: Annotated[Output | None, Parameter(show_default="out/NAME-cost")] = None,
     time: Annotated[str, Parameter(metavar="DURATION")] = "10min",
-    error: ErrorOption = None,
-    seed: Annotated[int | None, Parameter(converter=whole_number, show_default="the recipe's")] = None,
-    dry_run: DryRun = False,
-    cluster: ClusterOption = None,
     assignments: Set = None,
     console: Console = CONSOLE,
 ) -> None:
     """Measure error against time for this material and machine.
 
-    Writes cost.html, cost.csv and PNGs: the errors of complete runs, and, if --dry-run says so, a forecast
-    for up to four times as long. The same command resumes. A longer time keeps all measurements and adds
-    longer runs. With --cluster, workers measure, each for itself.
+    Writes cost.html, cost.csv and PNGs: the errors of complete runs, and of the generator's options. The same
+    command resumes. A longer time keeps all measurements and adds longer runs.
 
     Parameters
     ----------
@@ -47,88 +36,62 @@ def cost(
         YAML file; its material and generator are studied.
     time
         Time budget: 90s, 2min, 1h.
-    seed
-        Root seed of all random numbers.
     """
     from mbtf_core.files.folders import owned
-    from mbtf_core.run.cluster import open_runner
     from mbtf_core.run.signals import keep_on_interruption
     from mbtf_core.units import asked_duration, clock
     from mbtf_fit.config import DEFAULT_MODEL
     from mbtf_pipeline.collection.recipes import load
-    from mbtf_pipeline.cost.answers import answers
     from mbtf_pipeline.cost.measurement import other_work, pareto_front
     from mbtf_pipeline.cost.page import write_page
-    from mbtf_pipeline.cost.plan import plan_study
     from mbtf_pipeline.cost.study import run_study
     from mbtf_pipeline.recipe import Recipe
 
     loaded = load(recipe, assignments or [])
     if not isinstance(loaded, Recipe):
         raise UsageError("has several materials", where=recipe, hint="study the recipe of one of them")
-    check_error(error)
     if len(loaded.fit) > 1:
         console.note(f"only {DEFAULT_MODEL} is studied, with networks that suit the times; no other fit")
     seconds = asked_duration(time, "--time")
     folder = output if output is not None else loaded.folder.with_name(f"{loaded.folder.name}-cost")
-    if dry_run:
-        plan = plan_study(loaded, folder, seconds=seconds, seed=seed)
-        console.report(asdict(plan), plan.describe(seconds))
-        return
     keep_on_interruption(f"the measurements are kept in {folder}")
-    with (
-        open_runner(cluster, console.note) as runner,
-        console.progress(total=100, label="cost", unit="%") as bar,
-    ):
+    with console.progress(total=100, label="cost", unit="%") as bar:
         study = run_study(
             loaded,
             folder,
             seconds=seconds,
-            seed=seed,
             command=command_line(
                 *("mbtf-pipeline", "cost", recipe),
                 time=time,
-                error=error,
                 output=output,
-                seed=seed,
-                cluster=cluster,
                 set=assignments,
             ),
             announce=console.note,
             progress=lambda share, note: bar.update(round(100 * share, 1), note),
-            runner=runner,
         )
-    if error is not None:
-        study.asked = study.evidence.time_of(error)
     with owned(folder):
         page = write_page(study)
-    front, rows = pareto_front(study.measurements), answers(study.evidence)
-    busy = other_work(study.measurements)
+    front, busy = pareto_front(study.measurements), other_work(study.measurements)
     data = {
         "page": page,
         "measurements": len(study.measurements),
         "skipped": study.skipped,
         "failed": study.failed,
-        "answers": rows,
-        "asked": study.asked or None,
         "busy": busy or None,
-        "least_seconds": study.least,
         "seconds": study.description["taken"],
         "front": [
             {"seconds": m.seconds.value, "unexplained": m.error.as_dict(), "command": m.command}
             for m in front
         ],
     }
-    runs = [m for m in study.measurements if m.study == "run"]
-    generator = len(study.measurements) - len(runs)
-    counts = f"measured: {len(runs)} of complete runs, {generator} of the generator"
+    runs = len(study.runs)
+    counts = f"measured: {runs} of complete runs, {len(study.measurements) - runs} of the generator"
     taken = f"planned for {clock(seconds)}, took {clock(study.description['taken'])}"
     lines = [f"{page}: {taken}", f"configurations {counts}"]
     if study.skipped:
         lines[-1] += f"; not measured for lack of time: {len(study.skipped)}"
     lines += [f"failed: {text}" for text in study.failed]
-    lines += [row["line"] for row in rows]
-    lines += filter(None, [study.asked, study.more])
+    lines += [study.more] if study.more else []
     lines += [f"warning: {busy}"] if busy else []
-    lines += [f"  {m.seconds.value:.0f} s: {m.command}" for m in front]
+    lines += [f"{clock(m.seconds.value)}: unexplained variance {m.error}: {m.command}" for m in front]
     console.report(data, "\n".join(lines))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,19 +12,16 @@ from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import (
     ClusterOption,
     DryRun,
-    ErrorOption,
     Output,
     Quality,
     QualityOption,
     Set,
     Switch,
-    check_error,
     command_line,
 )
 from mbtf_core.errors import InputError, MbtfError, PartialError, UsageError
 from mbtf_core.run.signals import keep_on_interruption
 from mbtf_core.units import clock
-from mbtf_fit.cli.live import Live, live_view
 from mbtf_gen.config.pictures import EXPOSURE
 
 if TYPE_CHECKING:
@@ -39,11 +35,9 @@ def run(
     *,
     output: Annotated[Output | None, Parameter(show_default="out/NAME")] = None,
     quality: QualityOption = None,
-    error: ErrorOption = None,
     quick: Switch = False,
     dry_run: DryRun = False,
     force: Switch = False,
-    live: Live = False,
     cluster: ClusterOption = None,
     assignments: Set = None,
     console: Console = CONSOLE,
@@ -68,16 +62,15 @@ def run(
     from mbtf_core.run.processes import Processes
     from mbtf_pipeline.collection.recipes import Collection, LibraryRecipe, load
 
-    given = {"quality": quality, "error": error, "quick": quick, "output": output, "set": assignments}
+    given = {"quality": quality, "quick": quick, "output": output, "set": assignments}
     command = command_line("mbtf-pipeline", "run", recipe, **given)
     loaded, own = load(recipe, assignments or []), assignments or []
-    flags = given | {"live": live, "dry_run": dry_run}
-    check_error(error)
+    flags = given | {"dry_run": dry_run}
     if isinstance(loaded, Collection):
         from mbtf_pipeline.collection.run import run_collection
 
         hint = "set times in the recipe; --quick is its small size"
-        _refuse(flags, ("quality", "error", "dry_run", "live"), "a recipe of several materials", hint)
+        _refuse(flags, ("quality", "dry_run"), "a recipe of several materials", hint)
         folder = output or loaded.folder_of(quick)
         keep_on_interruption(f"the finished stages are kept in {folder}")
         # A crash ends one material of a library alone; the runs of a paper show their progress.
@@ -97,18 +90,12 @@ def run(
     else:
         _refuse(flags, ("quick",), "a recipe of one material", "use --quality draft")
         folder = output or loaded.folder
-        from mbtf_core.config.settings import explicit_options
         from mbtf_pipeline.forecast import RunForecaster, forecast_left
-        from mbtf_pipeline.recipe import is_single, preset_recipe, with_error
+        from mbtf_pipeline.recipe import preset_recipe
 
-        # The file may be another one when the run has ended.
-        single = is_single(explicit_options(recipe, own)["fit"])
         loaded = preset_recipe(recipe, quality, own)
-        draft = partial(preset_recipe, recipe, "draft", own)
-        if not dry_run and (expected := forecast_left(loaded, folder, draft)) is not None:
+        if not dry_run and (expected := forecast_left(loaded, folder)) is not None:
             console.note(expected)
-        if error is not None:
-            loaded = with_error(loaded, error)
         if dry_run:
             forecaster = RunForecaster(loaded)
             forecaster.job.announce_briefly()
@@ -119,17 +106,16 @@ def run(
         keep_on_interruption(f"the finished stages are kept in {folder}")
         from mbtf_pipeline.run import run_recipe
 
-        with open_runner(cluster, console.note) as runner, live_view(loaded.title, live, console) as page:
+        with open_runner(cluster, console.note) as runner:
             result = run_recipe(
                 loaded,
                 folder,
                 force=force,
                 command=command,
                 console=console,
-                live=page,
                 runner=runner,
             )
-        _report(result, console, quality, partial(_next_command, recipe, single, given))
+        _report(result, console, quality)
 
 
 def _refuse(given: Mapping[str, Any], flags: Sequence[str], kind: str, hint: str) -> None:
@@ -155,27 +141,7 @@ def _report_collection(done: CollectionResult, folder: Path, console: Console) -
         )
 
 
-def _next_command(
-    file: Path, single: bool, given: Mapping[str, Any], options: Mapping[str, dict[str, str]]
-) -> str | None:
-    """The command of a run, `given` its own options, with those that its fits, by name, need; None where they
-    need none. `single`: the recipe has no name for its fit."""
-    own, changes = given["set"] or [], dict[str, str]()
-    for name, needed in options.items():
-        changes |= {k.replace("fit", "fit" if single else f"fit.{name}", 1): v for k, v in needed.items()}
-    if not changes:
-        return None
-    kept = [text for text in own if text.partition("=")[0].strip() not in changes]
-    more = [*kept, *(f"{key}={value}" for key, value in changes.items())]
-    return command_line("mbtf-pipeline", "run", file, **{**given, "set": more})
-
-
-def _report(
-    result: RunResult,
-    console: Console,
-    quality: Quality | None,
-    again: Callable[[Mapping[str, Any]], str | None],
-) -> None:
+def _report(result: RunResult, console: Console, quality: Quality | None) -> None:
     from mbtf_fit import Material
     from mbtf_fit.cli.advice import suggest
     from mbtf_fit.formatting import outliers, unreliable
@@ -190,8 +156,7 @@ def _report(
     ran = {name: stage.seconds for name, stage in result.stages.items() if stage.reason}
     times = ", ".join(f"{name} {clock(seconds)}" for name, seconds in ran.items())
     lines = [f"{result.report}: {times or 'everything up to date'}"]
-    fits, options, recipe = {}, {}, read_resolved(folder)
-    queries = recipe.generate.queries.model_dump(mode="json")
+    fits, recipe = {}, read_resolved(folder)
     for fit, record in result.comparison["test"].items():
         errors, history = record["splits"]["test"], read_history(folder / FITS / fit)
         ending = describe_ending(recipe.fit[fit], history)
@@ -210,10 +175,6 @@ def _report(
         lines.append(f"  {name}: unexplained variance {estimate(errors['unexplained'])}{few}")
         more = [*outliers(errors), ending, fits[fit]["advice"]]
         lines += [f"    {line}" for line in more if line]
-        if step is not None:
-            options[fit] = step.options(recipe.fit[fit], record["training_seconds"], queries)
-    command = again(options)
-    lines += [] if command is None else ["next:", f"  {command}"]
     if result.viewer is not None:
         lines.append(f"{result.viewer}: open it in a browser to turn the fits under lights")
     data = {
@@ -227,7 +188,6 @@ def _report(
             for name, stage in result.stages.items()
         },
         "test": fits,
-        "next_command": command,
     }
     console.report(data, "\n".join(lines))
 

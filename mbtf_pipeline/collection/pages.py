@@ -12,7 +12,7 @@ from typing import Any
 from mbtf_core.files.editable import write_document
 from mbtf_core.units import clock
 from mbtf_pipeline.collection.finished_run import FinishedRun, each_fit
-from mbtf_pipeline.collection.paper_tables import ablations, levels, methods, offsets, timing, zooms
+from mbtf_pipeline.collection.paper_tables import ablations, levels, methods, timing
 from mbtf_pipeline.collection.ranking import ranking
 from mbtf_pipeline.collection.recipes import Published
 from mbtf_pipeline.compare.metrics import DEFINITIONS
@@ -29,7 +29,7 @@ RUNS, TABLES = "runs", "tables"
 _SIZE = 160
 # States of a material in the order of the page, and their text.
 _STATES = {"done": "done", "failed": "failed", "pending": "not run yet"}
-_TABLES = {f.__name__: f for f in (methods, levels, ablations, timing, offsets, zooms, ranking)}
+_TABLES = {f.__name__: f for f in (methods, levels, ablations, timing, ranking)}
 
 
 def write_page(folder: Path, record: Mapping[str, Any]) -> tuple[Path, list[Path]]:

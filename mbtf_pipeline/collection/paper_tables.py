@@ -1,4 +1,4 @@
-"""Tables of a paper: errors by method, level of detail, ablation and zoom; time of an evaluation, offsets."""
+"""Tables of a paper: errors by method, level of detail and ablation; time of an evaluation."""
 
 from __future__ import annotations
 
@@ -6,15 +6,12 @@ import math
 from collections.abc import Sequence
 from functools import partial
 from itertools import combinations
-from typing import Any
 
 from mbtf_core.stats import Estimate, psnr
 from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun, each_fit, mean_of, ratio_of
 from mbtf_pipeline.collection.recipes import Published, first_known
 from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_METRICS, PerceptualMetric
-from mbtf_pipeline.report.images import displacements, map_uri
 from mbtf_pipeline.report.plots import points
-from mbtf_pipeline.stages import COMPARE
 from mbtf_pipeline.tables import (
     Cell,
     Column,
@@ -23,28 +20,22 @@ from mbtf_pipeline.tables import (
     Thumbnail,
     decibel,
     estimate,
-    levels_text,
     rows_of,
     signed,
 )
 
-# Records of images.
-Pictures = Sequence[dict[str, Any]]
-_KINDS = {"query": "M at each pixel’s footprint", "pixel": "filtered pixels"}
-
 
 def _metric_column(metric: PerceptualMetric) -> Column:
-    """Mean of a metric over the images given as a third argument, by default over all."""
+    """Mean of a metric over the images."""
 
-    def mean(run: FinishedRun, fit: str, pictures: Pictures | None = None) -> Shown | None:
-        chosen = pictures or run.pictures
-        values = [metric.of(p["fits"][fit]) for p in chosen]
-        noises = [metric.of(p["references"][run.kind]) for p in chosen]
+    def mean(run: FinishedRun, fit: str) -> Shown | None:
+        values = [metric.of(p["fits"][fit]) for p in run.pictures]
+        noises = [metric.of(p["references"][run.kind]) for p in run.pictures]
         known, quiet = ([x for x in found if x is not None] for found in (values, noises))
-        if len(known) < len(chosen):
+        if len(known) < len(values):
             return None
         value = sum(known) / len(known)
-        noise = sum(quiet) / len(quiet) if len(quiet) == len(chosen) else None
+        noise = sum(quiet) / len(quiet) if len(quiet) == len(values) else None
         return Shown(metric.text(value, noise, with_noise=False), value, noise, "noise")
 
     return Column(metric.title, metric.key.replace(".", "_"), mean)
@@ -58,21 +49,14 @@ def _recorded(title: str, key: str, digits: str = ".3g") -> Column:
 _METRICS = [_metric_column(m) for m in PERCEPTUAL_METRICS]
 
 
-def _picture_error(
-    run: FinishedRun, fit: str, pictures: Pictures | None = None, *, key: str = "mse", kind: str = ""
-) -> Estimate | None:
-    """Mean over images of ``mse`` or ``relative_mse`` against a kind of reference, where the run has it."""
-    kind = kind or run.kind
-    if kind not in run.comparison["kinds"]:
-        return None
-    return mean_of([estimate(p["fits"][fit]["errors"][kind][key]) for p in pictures or run.pictures])
+def _picture_error(run: FinishedRun, fit: str, *, key: str = "mse") -> Estimate:
+    """Mean over images of ``mse`` or ``relative_mse``."""
+    return mean_of([estimate(p["fits"][fit]["errors"][run.kind][key]) for p in run.pictures])
 
 
-def _psnr(run: FinishedRun, fit: str, pictures: Pictures | None = None, *, kind: str = "") -> Shown | None:
+def _psnr(run: FinishedRun, fit: str) -> Shown:
     """PSNR in dB of the mean noise-free MSE of images, with white as peak."""
-    mse = _picture_error(run, fit, pictures, kind=kind)
-    if mse is None:
-        return None
+    mse = _picture_error(run, fit)
     found = psnr(mse, run.comparison["white"])
     return Shown(decibel(found, mse), found.value, found.error, "se")
 
@@ -204,51 +188,6 @@ def ablations(runs: Sequence[FinishedRun], published: Sequence[Published]) -> li
     return [Table("ablations", "Ablations", columns, rows_of(columns, each_fit(runs)))]
 
 
-def zooms(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
-    """Errors for every field of view and kind of reference, averaged over views and lights."""
-
-    def level(run: FinishedRun, fit: str, shown: Pictures) -> str:
-        return levels_text(shown[0]["levels"], run.comparison["finest"])
-
-    columns = [
-        MATERIAL,
-        Column("tiles across", "tiles_across", lambda *item: float(item[-1][0]["tiles_across"]), digits="g"),
-        Column("level", "level", level),
-        METHOD,
-    ]
-    for kind in dict.fromkeys(kind for run in runs for kind in run.comparison["kinds"]):
-        mse = partial(_picture_error, key="mse", kind=kind)
-        columns.append(Column(f"MSE against {_KINDS[kind]} [10⁻³/sr²]", f"mse_{kind}", mse, 1e3))
-        columns.append(Column(f"PSNR against {_KINDS[kind]}", f"psnr_{kind}", partial(_psnr, kind=kind)))
-    columns += _METRICS
-    items = [
-        (run, fit, [p for p in run.pictures if p["tiles_across"] == width])
-        for run in runs
-        for width in _widths(run)
-        for fit in run.fits
-    ]
-    rows, images = rows_of(columns, items), [row for run in runs for row in _zoom_images(run)]
-    return [Table("zooms", "Materials at several zooms", columns, rows, images=images)]
-
-
-def _widths(run: FinishedRun) -> list[float]:
-    return list(dict.fromkeys(p["tiles_across"] for p in run.pictures))
-
-
-def _zoom_images(run: FinishedRun) -> list[tuple[str, list[Thumbnail]]]:
-    """Rows of a run: each kind of reference, then each fit, from near to far."""
-    shown = [next(p for p in run.pictures if p["tiles_across"] == width) for width in _widths(run)]
-    sources = [(f"reference, {_KINDS[kind]}", "references", kind) for kind in run.comparison["kinds"]]
-    sources += [(fit, "fits", fit) for fit in run.fits]
-    return [
-        (
-            f"{run.title}: {title}",
-            [run.preview(p[group][name]["file"], f"{p['tiles_across']:g} tiles across") for p in shown],
-        )
-        for title, group, name in sources
-    ]
-
-
 def timing(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
     """Milliseconds of one evaluation of 1080p, in total and by stage."""
     items = [
@@ -276,48 +215,3 @@ def timing(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[
         Column("timed queries", "queries", lambda fit, record: record["queries"]),
     ]
     return [Table("timing", "Time of one evaluation of 1080p", columns, rows_of(columns, items))]
-
-
-def _view(title: str, key: str) -> Column:
-    return Column(title, key, lambda run, fit, record: float(record["view"][key]), digits=".0f")
-
-
-def _learned(title: str, key: str, name: str, digits: str) -> Column:
-    return Column(title, name, lambda run, fit, record: record["fits"][fit][key], digits=digits)
-
-
-_OFFSETS = (
-    MATERIAL,
-    METHOD,
-    _view("view: elevation", "elevation"),
-    _view("azimuth", "azimuth"),
-    Column("spread, traced [tile widths]", "spread_traced", lambda *item: item[-1]["spread"], digits=".2g"),
-    _learned("spread, learned [tile widths]", "spread", "spread_learned", ".2g"),
-    _learned("correlation", "correlation", "correlation", ".2f"),
-    _learned("slope of learned on traced", "slope", "slope", ".2f"),
-)
-
-
-def offsets(runs: Sequence[FinishedRun], published: Sequence[Published]) -> list[Table]:
-    """Agreement of learned and traced offsets for every view."""
-    items = [
-        (run, fit, record)
-        for run, fit in each_fit(runs)
-        for record in run.comparison["offsets"]
-        if fit in record["fits"]
-    ]
-    rows, images = rows_of(_OFFSETS, items), [row for run in runs for row in _offset_images(run)]
-    return [Table("offsets", "Learned offsets by view angle", _OFFSETS, rows, images=images)]
-
-
-def _offset_images(run: FinishedRun) -> list[tuple[str, list[Thumbnail]]]:
-    out = []
-    records = run.comparison["offsets"]
-    for fit in (None, *records[0]["fits"]) if records else ():
-        maps, _, scale = displacements(run.folder / COMPARE, records, fit)
-        row = [
-            Thumbnail(map_uri(m / scale, "signed"), f"elevation {record['view']['elevation']:g}°")
-            for m, record in zip(maps, records, strict=True)
-        ]
-        out.append((f"{run.title}, {fit or 'traced'}: ± {scale:.2g} tile widths", row))
-    return out

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from mbtf_core.config.settings import FileName, Settings, build, deep_merge, distinct, resolve
 from mbtf_core.errors import InputError, MbtfError
-from mbtf_core.units import Duration
 from mbtf_fit.config import DEFAULT_MODEL, FIBER_MODEL
 from mbtf_pipeline.collection.materials import find_materials, name_materials
 from mbtf_pipeline.compare.perceptual_metrics import weights_file
 from mbtf_pipeline.recipe import Name, Recipe, load_recipe, read_recipe
 
-TableName = Literal["methods", "levels", "ablations", "timing", "offsets", "zooms", "ranking"]
+TableName = Literal["methods", "levels", "ablations", "timing", "ranking"]
 # The name of a fit that is repeated: what is trained, and the seed.
 _SEEDED = re.compile(r"(.+)-seed([0-9]+)")
 
@@ -124,22 +123,9 @@ class Collection(Settings):
     quick: Layer = Field(Layer(), description="overrides the base with --quick")
     materials: dict[Name, MaterialLayer] = Field({}, description="name → path or layer")
     variants: dict[Name, Layer] = Field({}, description="name → options; run for every material")
-    training: Duration | None = Field(
-        None, description="training time of each run, shared equally by its fits; default: theirs"
-    )
     learn_from_others: list[Name] = Field(
         [], description="fits that also learn from the slices of all other materials"
     )
-
-    @model_validator(mode="after")
-    def _one_training_time(self) -> Self:
-        layers = {"base": self.base, **{f"materials.{name}": one for name, one in self.materials.items()}}
-        for where, layer in layers.items() if self.training is not None else ():
-            for fit, options in {"each_fit": layer.each_fit, **layer.fit}.items():
-                training = (options or {}).get("training") or {}
-                if isinstance(training, Mapping) and {training.get("time"), training.get("steps")} != {None}:
-                    raise ValueError(f"{where}: '{fit}' has a training time beside 'training'; leave out one")
-        return self
 
     @property
     def folder(self) -> Path:
@@ -214,11 +200,6 @@ class Collection(Settings):
                 f"{fit}-seed{seed}": {**options, "seed": seed}
                 for seed in seeds
                 for fit, options in data["fit"].items()
-            }
-        if self.training is not None:
-            time = {"time": round(self.training / len(data["fit"]), 3), "steps": None}
-            data["fit"] = {
-                fit: deep_merge(options, {"training": time}) for fit, options in data["fit"].items()
             }
         data["generate"]["material"] = str(path)
         # The optional metric is computed if its weights are installed.

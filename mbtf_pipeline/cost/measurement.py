@@ -126,7 +126,7 @@ class Measurement:
 
 
 def measure(configuration: Configuration, conditions: Conditions) -> Measurement:
-    """Measure a configuration; a task, see :mod:`mbtf_core.run.task`.
+    """Measure a configuration.
 
     With a share s of the processors, a time t would be between s t and t on a machine without other work.
     """

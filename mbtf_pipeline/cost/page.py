@@ -9,11 +9,8 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mbtf_core.files.editable import write_document
 from mbtf_core.units import clock
-from mbtf_pipeline.cost.answers import Evidence, answers
 from mbtf_pipeline.cost.measurement import Measurement, other_work, pareto_front
 from mbtf_pipeline.cost.study import Study
 from mbtf_pipeline.report.plots import Series, plot
@@ -93,25 +90,19 @@ def _figure(
     return {"svg": plot(shown, x, y, f"cost {png.stem}", png=png, **options), "caption": caption}
 
 
-def _front_section(runs: Sequence[Measurement], evidence: Evidence, png: Path) -> dict[str, Any]:
-    """All runs, their Pareto front and the forecast; of a single run its numbers."""
+def _front_section(runs: Sequence[Measurement], png: Path) -> dict[str, Any]:
+    """All runs and their Pareto front; of a single run its numbers."""
     front = pareto_front(runs)
     table = _table(_RUNS, front).for_page()
     if len(runs) < 2 and front:
         png.unlink(missing_ok=True)
         figure = {"svg": "", "caption": "One complete run was measured; a plot and a Pareto front take two."}
         return {"figure": figure, "table": table}
-
     axes = "seconds in total, from height map to material", "unexplained variance of test queries"
     bars = "their time: scatter, and what other work may have added"
-    series = [_series("complete runs", runs, style="points", x_error_name=bars)]
-    if evidence.curve is not None:
-        x = np.geomspace(evidence.runs[-1].seconds.value, evidence.farthest, 12).tolist()
-        found = [one for seconds in x if (one := evidence.error_after(seconds)) is not None]
-        bounds = [one.value - one.low for one in found], [one.high - one.value for one in found]
-        series.append(Series("forecast, 95% interval", x, [one.value for one in found], bounds))
+    series = _series("complete runs", runs, style="points", x_error_name=bars)
     stepped = [(m.seconds.value, m.error.value) for m in front] if len(front) > 1 else []
-    figure = _figure(series, *axes, png, front=stepped)
+    figure = _figure([series], *axes, png, front=stepped)
     return {"figure": figure, "table": table}
 
 
@@ -145,11 +136,11 @@ def _generator_section(found: Sequence[Measurement], png: Path) -> dict[str, Any
 def write_page(study: Study) -> Path:
     """Write CSV, page and plots into the study's folder; returns the path of the page."""
     write_document(study.folder / CSV_NAME, to_csv(study.measurements))
-    sections, evidence = {}, study.evidence
+    sections = {}
     for kind in ("run", *_COMPARISONS):
         found = [m for m in study.measurements if m.study == kind]
         if found and kind == "run":
-            sections["front"] = _front_section(found, evidence, study.folder / "front.png")
+            sections["front"] = _front_section(found, study.folder / "front.png")
         elif len(found) > 1:
             sections[kind] = _generator_section(found, study.folder / f"{kind}.png")
     html = render(
@@ -158,14 +149,12 @@ def write_page(study: Study) -> Path:
         planned=clock(study.description["time"]),
         taken=clock(study.description["taken"]),
         sections=sections,
-        answers=answers(evidence),
-        asked=study.asked,
         more=study.more,
         busy=other_work(study.measurements),
         skipped=study.skipped,
         failed=study.failed,
         deviation=f"{study.deviation.scaled(100.0)}%",
-        test=statistics.median([100 * m.details["test_error"] for m in evidence.runs] or [0.0]),
+        test=statistics.median([100 * m.details["test_error"] for m in study.runs] or [0.0]),
     )
     write_document(study.folder / PAGE_NAME, html)
     return study.folder / PAGE_NAME

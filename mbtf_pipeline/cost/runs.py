@@ -8,10 +8,8 @@ than on that of paths. Data and fits come from the generator and the fitter, cal
 
 from __future__ import annotations
 
-import os
 import shlex
 import shutil
-import socket
 import time
 import timeit
 from collections.abc import Sequence
@@ -38,20 +36,16 @@ from mbtf_pipeline.cost.measurement import Conditions, Configuration, Measuremen
 if TYPE_CHECKING:
     from mbtf_fit.data.queries import ShardQueries
 
-# Shares of a study's time that the generator and the runs get. The rest is left for start-up, the test set,
-# loading and evaluation.
+# Shares of a study's time that comparisons of the generator and runs get. The rest is left for start-up, the
+# test set, loading and evaluation. The first seconds are for runs alone.
 GENERATOR, RUNS = 0.1, 0.7
+RUNS_ALONE = 90.0
 # Total times of runs, seconds: this one, twice, four times, ...; the share of each that generates.
 SHORTEST = 6.0
 SHARE, OTHER_SHARES = 0.35, (0.6, 0.15)
 _FEWEST_QUERIES = 20_000
 # Fewest training steps of a run: the error of a shorter fit says nothing about longer ones.
 FEWEST_STEPS = 200
-# Series of a run for which they took longer than planned.
-SLOW_SERIES = f"{FEWEST_STEPS} training steps"
-# Fewest total times that tell how the error falls, and the study's seconds in which they are measured.
-FEWEST_TOTALS = 3
-LEAST_SECONDS = SHORTEST * (2**FEWEST_TOTALS - 1 + 2 ** (FEWEST_TOTALS - 1) - 1) / RUNS
 # Test queries, and paths of each.
 TEST = (1 << 18, 16)
 # The smallest split that the generator takes.
@@ -105,7 +99,7 @@ class Run(Configuration):
         start = time.perf_counter()
         shards, generation_seconds = _generated(conditions, self.seed, (self.queries, self.spp), _NO_QUERIES)
         options = nested({"seed": conditions.config.seed + self.seed, **self.fit})
-        out = _own_folder(conditions) / f"fit-{data_sha256(self.key)[:12]}"
+        out = conditions.folder / f"fit-{data_sha256(self.key)[:12]}"
         shutil.rmtree(out, ignore_errors=True)
         result = fit(FitConfig.model_validate(options), shards, out)
         error = unexplained_variance(result.material.predict(test), test.value_a, test.value_b, test.weight)
@@ -187,11 +181,6 @@ def test_set(conditions: Conditions) -> ShardQueries:
     return found
 
 
-def _own_folder(conditions: Conditions) -> Path:
-    """This process's folder of temporary data and fits."""
-    return conditions.folder / f"{socket.gethostname()}-{os.getpid()}"
-
-
 def _generated(
     conditions: Conditions, seed: int, train: tuple[int, int], test: tuple[int, int]
 ) -> tuple[Path, float]:
@@ -199,7 +188,7 @@ def _generated(
     queries = {"train": str(train[0]), "spp": train[1], "test": str(test[0]), "test_spp": test[1]}
     changes = {"seed": conditions.config.seed + seed, "queries": {**queries, "layout": "shuffled"}}
     data = deep_merge(conditions.config.model_dump(mode="json"), changes)
-    folder = _own_folder(conditions) / f"data-{data_sha256(data)[:12]}"
+    folder = conditions.folder / f"data-{data_sha256(data)[:12]}"
     # Data that an interrupted study left behind were not timed.
     shutil.rmtree(folder, ignore_errors=True)
     start = time.perf_counter()

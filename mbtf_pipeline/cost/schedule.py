@@ -8,9 +8,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import count, takewhile
 
-from mbtf_core.errors import PartialError
-from mbtf_core.run.runner import Runner
-from mbtf_core.run.task import Item
+from mbtf_core.errors import MbtfError, PartialError
+from mbtf_core.run.task import failure
 from mbtf_core.units import clock
 from mbtf_pipeline.cost.generator import benchmark_of, generator_configurations, path_seconds
 from mbtf_pipeline.cost.measurement import (
@@ -21,15 +20,11 @@ from mbtf_pipeline.cost.measurement import (
     measure,
 )
 from mbtf_pipeline.cost.runs import (
-    FEWEST_TOTALS,
     GENERATOR,
-    LEAST_SECONDS,
-    SHORTEST,
-    SLOW_SERIES,
+    RUNS_ALONE,
     TEST,
     Run,
     planned_runs,
-    shortest_total,
 )
 
 # Seconds by which a run exceeds generating and training on a machine without other work, until one has been
@@ -46,7 +41,7 @@ class Measurements:
 
     Attributes
     ----------
-    conditions, store, runner : what measures, and where the results are kept
+    conditions, store : what a measurement needs, and where the results are kept
     note : called when a configuration is taken, with its label and the time that it is expected to take
     failed : why runs failed
     path_seconds, step_seconds : seconds of generating a query over its number of paths; of a training step
@@ -55,15 +50,12 @@ class Measurements:
 
     conditions: Conditions
     store: MeasurementFolder
-    runner: Runner
     note: Callable[[str], None] = lambda label: None
     found: dict[str, Measurement] = field(default_factory=dict)
     failed: dict[str, str] = field(default_factory=dict)
     path_seconds: float = 0.0
     step_seconds: float = 0.0
     share: float = 1.0
-    # Taken, but not measured yet.
-    _pending: dict[str, Configuration] = field(default_factory=dict)
     # Whether a run has made the test set.
     tested: bool = False
     # Seconds of measured runs besides the test set, generating and training.
@@ -98,8 +90,7 @@ class Measurements:
         if self.recall(first):
             self.step_seconds = _step_seconds(self.found[first.label])
         runs = planned_runs(seconds, spp, self.path_seconds, self.step_seconds)
-        # With its few queries it follows another law than the others.
-        return runs if first in runs else [replace(first, series=SLOW_SERIES), *runs]
+        return runs if first in runs else [first, *runs]
 
     def recall(self, configuration: Configuration) -> bool:
         """Whether a measurement is stored; it then counts as found."""
@@ -115,81 +106,41 @@ class Measurements:
         self.found[configuration.label] = measurement
 
     def measure(self, wanted: Iterable[Configuration], *, independent: bool) -> None:
-        """Measure configurations; each is taken once a worker is nearly free.
+        """Measure configurations, one after the other.
 
-        One that fails says nothing about others that are `independent`; it is an InputError for those that
-        are not. A PartialError where a worker died, or the disk is full.
+        One that fails says nothing about others that are `independent`; its error is raised for those that
+        are not. A PartialError where the disk is full.
         """
-
-        def items() -> Iterator[Item]:
-            for configuration in wanted:
-                self._pending[configuration.label] = configuration
-                left = ""
-                if isinstance(configuration, Run):
-                    left = f", about {clock(self.expected_seconds(configuration))}"
-                self.note(configuration.label + left)
-                arguments = {"configuration": configuration, "conditions": self.conditions}
-                yield Item(configuration.label, arguments)
-
-        for done in self.runner.map(measure, items(), independent=independent, ahead=0):
-            configuration = self._pending.pop(done.name)
-            if done.error and not done.fatal:
-                raise PartialError(f"{done.name} failed: {done.error}", hint=done.hint or RESUMES)
-            if done.error:
+        for configuration in wanted:
+            label, left = configuration.label, ""
+            if isinstance(configuration, Run):
+                left = f", about {clock(self.expected_seconds(configuration))}"
+            self.note(label + left)
+            try:
+                measured = measure(configuration, self.conditions)
+            except PartialError as error:
+                what = failure(error)["error"]
+                raise PartialError(f"{label} failed: {what}", hint=error.hint or RESUMES) from None
+            except MbtfError as error:
+                if not independent:
+                    raise
                 # The other runs are worth a page all the same.
-                self.failed[done.name] = done.error
+                self.failed[label] = failure(error)["error"]
                 continue
-            self._add(configuration, done.value)
-            self.note(f"{done.name}: done")
-            self.store.put(configuration, done.value)
+            self._add(configuration, measured)
+            self.note(f"{label}: done")
+            self.store.put(configuration, measured)
             self.tested = self.tested or isinstance(configuration, Run)
-
-    @property
-    def test_seconds(self) -> float:
-        """Expected seconds of making the test set."""
-        return TEST[0] * TEST[1] * self.path_seconds
 
     def expected_seconds(self, run: Run) -> float:
         """Expected seconds of measuring a run, the first one with the test set."""
         planned = run.planned_seconds(self.path_seconds, self.step_seconds)
-        return planned + (0.0 if self.tested else self.test_seconds) + self.overhead
-
-    def fitting(self, runs: Sequence[Run], before: float, seconds: float) -> tuple[list[Run], float]:
-        """The runs that are not measured yet and are expected to fit into a time, after `before` seconds
-        without runs; and the seconds of everything."""
-        found, spent, test = list[Run](), before, 0.0 if self.tested else self.test_seconds
-        for run in runs:
-            after = spent + run.planned_seconds(self.path_seconds, self.step_seconds) + self.overhead + test
-            if not self.recall(run) and after <= seconds:
-                found.append(run)
-                spent, test = after, 0.0
-        return found, spent
-
-    def least_seconds(self, spp: int, setup: float) -> float | None:
-        """Seconds of a study that measures runs of enough lengths for a forecast, by what runs have taken on
-        this machine, after `setup` seconds of loading and reference; None where they are measured."""
-        enough = LEAST_SECONDS * shortest_total(self.step_seconds) / SHORTEST
-        needed = planned_runs(enough, spp, self.path_seconds, self.step_seconds)[:FEWEST_TOTALS]
-        missing = [run for run in needed if not self.recall(run)]
-        return max(LEAST_SECONDS, self._study_seconds(missing, setup)) if missing else None
-
-    def least_run_seconds(self, spp: int, setup: float) -> float | None:
-        """Likewise of a study that measures one run; None where any is measured."""
-        runs = planned_runs(0.0, spp, self.path_seconds)
-        return None if self._besides else self._study_seconds(runs, setup)
-
-    def _study_seconds(self, runs: Sequence[Run], setup: float) -> float:
-        """Seconds of a study that has time for some runs, and makes the test set anew."""
-        planned = (run.planned_seconds(self.path_seconds, self.step_seconds) for run in runs)
-        needed = setup + self.test_seconds + sum(planned) + len(runs) * self.overhead
-        # Of what exceeds the least time of all machines, the generator gets its share.
-        share = COMPILING * GENERATOR
-        return max(needed, (needed - share * LEAST_SECONDS) / (1.0 - share))
+        test = 0.0 if self.tested else TEST[0] * TEST[1] * self.path_seconds
+        return planned + test + self.overhead
 
     def fits(self, run: Run, seconds: float) -> bool:
-        """Whether the workers can begin and finish a run in a time, besides those that they have taken."""
-        taken = sum(self.expected_seconds(r) for r in self._pending.values() if isinstance(r, Run))
-        return max(1, self.runner.workers) * seconds - taken > self.expected_seconds(run)
+        """Whether a run can begin and finish in a time."""
+        return seconds > self.expected_seconds(run)
 
     def group(self, run: Run) -> list[Measurement]:
         """The measurements of a run with the first seeds, without gaps."""
@@ -209,8 +160,8 @@ class Measurements:
 
 
 def generator_seconds(seconds: float) -> float:
-    """Time for comparisons of the generator: a share of what a study has beyond the least that forecasts."""
-    return GENERATOR * max(0.0, seconds - LEAST_SECONDS)
+    """Time of a study for comparisons of the generator."""
+    return GENERATOR * max(0.0, seconds - RUNS_ALONE)
 
 
 def _step_seconds(run: Measurement) -> float:

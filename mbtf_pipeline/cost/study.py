@@ -1,32 +1,23 @@
-"""A cost study: measures what accuracy costs within a given time, and resumes where it stopped.
-
-Measurements are tasks: this process does them one after the other, the workers of a cluster each for itself.
-A worker generates data and fits as a process of its own would, and measures the time itself, so that all
-figures are of the workers' machine and threads.
-"""
+"""A cost study: measures what accuracy costs within a given time, and resumes where it stopped."""
 
 from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from mbtf_core.config.yaml_file import dump_yaml
-from mbtf_core.errors import InputError, PartialError
+from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import read_json
 from mbtf_core.files.editable import write_document
 from mbtf_core.files.folders import ELSEWHERE, OutputKind, check_space, owned
-from mbtf_core.run.runner import Runner
-from mbtf_core.run.task import Item, worker_threads
 from mbtf_core.stats import Estimate
-from mbtf_core.units import expectation, rounded_duration
+from mbtf_core.units import expectation, format_duration
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_pipeline.cost.answers import Evidence, is_significant
 from mbtf_pipeline.cost.generator import benchmark_of
 from mbtf_pipeline.cost.measurement import (
     CONFIG_NAME,
@@ -38,9 +29,10 @@ from mbtf_pipeline.cost.measurement import (
     seed_deviation,
 )
 from mbtf_pipeline.cost.runs import GENERATOR, Run, disk_bytes, test_set
-from mbtf_pipeline.cost.schedule import COMPILING, RESUMES, Measurements, generator_seconds
+from mbtf_pipeline.cost.schedule import COMPILING, Measurements, generator_seconds
 from mbtf_pipeline.recipe import Recipe
 from mbtf_pipeline.stages import machine
+from mbtf_pipeline.tables import is_significant
 
 STUDY = OutputKind("study.json", "mbtf-cost", 2, "a cost study")
 
@@ -59,66 +51,37 @@ class Study:
     # Configurations for which no time was left, and runs that failed, with the reason.
     skipped: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
-    # Forecast of the error that was asked for.
-    asked: str = ""
-    # Seconds of a study that measures a run, and of one that forecasts; None where this one does.
-    least_run: float | None = None
-    least: float | None = None
 
-    @cached_property
-    def evidence(self) -> Evidence:
-        """What the complete runs say of other times and errors."""
-        return Evidence.of(self.measurements, self.deviation)
+    @property
+    def runs(self) -> list[Measurement]:
+        """Measurements of complete runs."""
+        return [m for m in self.measurements if m.study == "run"]
 
     @property
     def more(self) -> str:
-        """Which longer study would measure a run, or forecast, in one sentence; empty where this one does."""
-        if self.least is None:
-            return ""
-        if self.least_run is not None:
-            return no_run(self.least_run, self.least)
-        runs = [m for m in self.measurements if m.study == "run"]
-        if uncertain := sum(not is_significant(run) for run in runs):
-            longer = rounded_duration(2.0 * self.description["time"])
-            return f"errors of {uncertain} runs are not significant: repeat the command with --time {longer}"
-        enough = self.least <= self.description["time"]
-        how = "the same command" if enough else f"the command with --time {rounded_duration(self.least)}"
-        return f"too few complete runs for a forecast: repeat {how}; it keeps these runs and adds others"
+        """What a longer study is needed for, in one sentence; empty where this one suffices."""
+        longer = f"repeat the command with --time {format_duration(2.0 * self.description['time'])}"
+        if not self.runs:
+            return f"no complete run fits into the time: {longer}"
+        uncertain = sum(not is_significant(run.error) for run in self.runs)
+        return f"errors of {uncertain} runs are not significant: {longer}" if uncertain else ""
 
 
-def study_config(config: GeneratorConfig, seed: int | None) -> GeneratorConfig:
+def study_config(config: GeneratorConfig) -> GeneratorConfig:
     """A recipe's generator as its study uses it: without a target error, which would override the numbers of
     paths, and with shuffled queries that share no paths."""
     own = {"target_error": None, "layout": "shuffled", "lights_per_path": 1}
-    queries = config.queries.model_copy(update=own)
-    seeds = {} if seed is None else {"seed": seed}
-    return config.model_copy(update={"queries": queries, **seeds})
+    return config.model_copy(update={"queries": config.queries.model_copy(update=own)})
 
 
-def measuring_machine() -> dict[str, str]:
-    """Record of the machine that runs it; a task."""
-    found = machine()
-    if (threads := worker_threads()) is not None:
-        found["system"] += f", workers of {threads} thread{'s' * (threads != 1)}"
-    return found
-
-
-def claim(folder: Path, on: Mapping[str, str]) -> None:
-    """Take an empty folder, or one that holds a study of the kind of machine that measures."""
+def claim(folder: Path) -> None:
+    """Take an empty folder, or one that holds a study of this kind of machine."""
     if not STUDY.check(folder):
         return
-    there, here = read_json(folder / STUDY.record)["machine"]["system"], on["system"]
+    there, here = read_json(folder / STUDY.record)["machine"]["system"], machine()["system"]
     if there != here:
         problem = f"holds a cost study of another kind of machine ({there}; this is {here})"
         raise InputError(problem, where=folder, hint=ELSEWHERE)
-
-
-def no_run(least_run: float, least: float) -> str:
-    """That a study has no time for a complete run, and the times of those that have."""
-    return (
-        f"no complete run fits into the time: one takes --time {rounded_duration(least_run)}, and a forecast "
-        f"--time {rounded_duration(least)}"
-    )
 
 
 def run_study(
@@ -126,11 +89,9 @@ def run_study(
     folder: Path,
     *,
     seconds: float,
-    seed: int | None = None,
     command: str = "",
     progress: Callable[[float, str], None] = lambda share, note: None,
     announce: Callable[[str], None] = lambda text: None,
-    runner: Runner | None = None,
 ) -> Study:
     """Measure what the time allows for the material and generator of a recipe; stored measurements are kept
     and cost no time.
@@ -138,18 +99,15 @@ def run_study(
     Parameters
     ----------
     seconds : time of the study
-    seed : of queries, paths and initial weights; the recipe's by default
     command : for the page
     progress, announce : called with (share of the time spent, note), and with lines for the user
-    runner : measures; its workers on their machines and with their threads. This process by default
 
     Raises
     ------
     InputError : the folder holds something else, there is nothing to fit, or the disk is too small
-    PartialError : a worker died, or the disk is full; finished measurements are kept
+    PartialError : the disk is full; finished measurements are kept
     """
     start = time.perf_counter()
-    runner = runner or Runner()
 
     def spent() -> float:
         return time.perf_counter() - start
@@ -157,13 +115,10 @@ def run_study(
     def note(text: str) -> None:
         progress(min(1.0, spent() / seconds), text)
 
-    job = Job.load(study_config(recipe.generate, seed))
+    job = Job.load(study_config(recipe.generate))
     config = job.config
     with owned(folder):
-        (there,) = runner.map(measuring_machine, [Item("machine")])
-        if there.error:
-            raise PartialError(f"no worker answers: {there.error}", hint=there.hint or RESUMES)
-        claim(folder, there.value)
+        claim(folder)
         conditions = Conditions.of(job, folder, GENERATOR * seconds)
         note("reference, which compiles the kernels")
         # Before anything is written: a refused study leaves the folder as it was.
@@ -175,15 +130,14 @@ def run_study(
             "seed": config.seed,
             "material": config.material,
             "date": time.strftime("%Y-%m-%d"),
-            "machine": there.value,
+            "machine": machine(),
         }
-        setup = description["setup_seconds"] = spent()
         STUDY.write(folder, description)
         write_document(folder / CONFIG_NAME, dump_yaml(config.model_dump(mode="json")))
-        measurements = Measurements(conditions, MeasurementFolder(folder, conditions), runner, note)
+        measurements = Measurements(conditions, MeasurementFolder(folder, conditions), note)
         configurations = measurements.configurations
-        # Configurations take longer than their share where kernels are compiled; workers start anew.
-        until = COMPILING * generator_seconds(seconds) + (0.0 if runner.here else spent())
+        # Configurations take longer than their share where kernels are compiled.
+        until = COMPILING * generator_seconds(seconds)
 
         def missing() -> Iterator[Configuration]:
             for number, configuration in enumerate(configurations):
@@ -195,10 +149,9 @@ def run_study(
             spp = config.queries.spp
             measurements.recall_rate(spp)
             runs = measurements.plan_runs(seconds, spp)
-            size = disk_bytes(runs) * runner.workers
+            size = disk_bytes(runs)
             check_space(folder, size, "give a shorter --time, or choose another folder with -o")
-            _, expected = measurements.fitting(runs, spent(), seconds)
-            announce(expectation(expected if runner.here else seconds, size))
+            announce(expectation(seconds, size))
 
             def fits(run: Run) -> bool:
                 return measurements.fits(run, seconds - spent())
@@ -226,6 +179,4 @@ def run_study(
         deviation,
         [c.label for c in (*configurations, *first) if c.label not in known and c.label not in failed],
         [f"{label}: {why}" for label, why in failed.items()],
-        least_run=measurements.least_run_seconds(spp, setup),
-        least=measurements.least_seconds(spp, setup),
     )

@@ -258,19 +258,6 @@ def _numbers(comparison: Mapping[str, Any], picture: Mapping[str, Any], kind: st
     return rows
 
 
-def displacements(
-    folder: Path, records: list[dict[str, Any]], fit: str | None
-) -> tuple[list[Pixels], list[float], float]:
-    """Displacements towards the viewer, traced (`fit` is None) or learned, minus their median: one map per
-    record, their medians in tile widths, and the end of their common scale."""
-    maps: list[Pixels] = [
-        towards_view(read_offset(folder / _offset_file(r, fit)), SceneView(**r["view"])) for r in records
-    ]
-    medians = [float(np.median(m)) for m in maps]
-    centered = [m - median for m, median in zip(maps, medians, strict=True)]
-    return centered, medians, common_scale(centered)
-
-
 def offset_section(folder: Path, records: list[dict[str, Any]], gallery: Gallery) -> list[dict[str, Any]]:
     """Rows of offset images: traced, then learned by each fit, each with its own color scale."""
     fits = (None, *records[0]["fits"]) if records else ()
@@ -284,9 +271,14 @@ def _offset_file(record: Mapping[str, Any], fit: str | None) -> str:
 def _offset_row(
     folder: Path, records: list[dict[str, Any]], fit: str | None, gallery: Gallery
 ) -> dict[str, Any]:
+    """Displacements towards the viewer, traced (`fit` is None) or learned, minus their median."""
     title = "Traced through the heights" if fit is None else f"Offset of {fit}"
-    maps, medians, scale = displacements(folder, records, fit)
-    cells = []
+    whole = [
+        towards_view(read_offset(folder / _offset_file(r, fit)), SceneView(**r["view"])) for r in records
+    ]
+    medians = [float(np.median(m)) for m in whole]
+    maps: list[Pixels] = [m - median for m, median in zip(whole, medians, strict=True)]
+    scale, cells = common_scale(maps), []
     for number, (record, values, median) in enumerate(zip(records, maps, medians, strict=True)):
         name = f"offset-{fit or 'traced'}-{number}"
         gallery[name] = map_uri(values / scale, "signed")

@@ -45,8 +45,7 @@ class Series:
 
     Attributes
     ----------
-    x, y : (n,); x_error, y_error : their standard errors, (n,), those of y also (2, n), below and above, or
-        none; those not finite are not drawn
+    x, y : (n,); x_error, y_error : their standard errors, (n,), or none; those not finite are not drawn
     labels : (n,), one per point, or none
     style : a line with a band, points, or points joined by a line; hollow : whether markers are hollow
     x_error_name : what the legend calls bars along x, if anything
@@ -55,7 +54,7 @@ class Series:
     name: str
     x: Sequence[float]
     y: Sequence[float]
-    y_error: Sequence[float] | Sequence[Sequence[float]] | None = None
+    y_error: Sequence[float] | None = None
     x_error: Sequence[float] | None = None
     labels: Sequence[str] = ()
     style: Literal["line", "points", "joined"] = "line"
@@ -163,8 +162,8 @@ def _range(series: Sequence[Series]) -> tuple[float, float]:
 
 def _bounds(one: Series) -> NDArray[np.float64]:
     """Ends (2, n) of the error bars of a series, below and above."""
-    lower, upper = np.broadcast_to(np.asarray(one.y_error, float), (2, len(one.y)))
-    return np.asarray(one.y, float) + np.stack([-lower, upper])
+    error = np.asarray(one.y_error, float)
+    return np.asarray(one.y, float) + np.stack([-error, error])
 
 
 def _draw(axes: Any, index: int, one: Series, low: float, high: float) -> list[tuple[Any, str]]:

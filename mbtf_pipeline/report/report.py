@@ -31,7 +31,7 @@ from mbtf_pipeline.report.sections import (
 from mbtf_pipeline.stages import COMPARE, FITS, REPORT, RUN, SHARDS, VIEWER
 
 # Raised when the report or the viewer's page changes; part of the stage's key.
-LAYOUT = 20
+LAYOUT = 21
 # Path-traced pictures in the viewer's page.
 _MOST_PICTURES = 4
 

@@ -40,7 +40,6 @@ def error_context(comparison: Mapping[str, Any], training: Mapping[str, Any]) ->
     groupings = [shown for grouping in _GROUPINGS if (shown := _grouping(tests, *grouping)) is not None]
     return {
         "facts": _facts(comparison, tests, titles),
-        "ranking": _ranking(comparison),
         "test": next(iter(tests.values())),
         "error_table": _error_table(comparison, titles),
         "error_plots": [shown for shown, _ in groupings],
@@ -82,34 +81,6 @@ def _differs(comparison: Mapping[str, Any], fit: str) -> bool:
     """Whether a fit is the first one, or differs from it significantly on the test queries."""
     difference = comparison["test"][fit].get("mse_minus_first")
     return difference is None or is_significant(estimate(difference))
-
-
-def _ranking(comparison: Mapping[str, Any]) -> str:
-    """Why test queries and images rank the fits differently; empty if they do not."""
-    first, kind = comparison["fits"][0], comparison["kinds"][0]
-
-    def of_images(fit: str) -> float:
-        found = [p["fits"][fit]["errors"][kind]["mse"]["value"] for p in comparison["pictures"]]
-        return float(np.mean([math.inf if mse is None else mse for mse in found]))
-
-    def of_queries(fit: str) -> float:
-        mse = comparison["test"][fit]["splits"]["test"]["mse"]["value"]
-        return math.inf if mse is None else mse
-
-    queries, images = (sorted(comparison["fits"], key=key) for key in (of_queries, of_images))
-    if queries == images:
-        return ""
-    text = (
-        f"From best to worst, the fits are {', '.join(queries)} by the MSE of test queries, but "
-        f"{', '.join(images)} by the mean MSE of the images. Test queries have footprints, lights and views "
-        "of all kinds, the images only the few that they show."
-    )
-    equal = [fit for fit in comparison["fits"] if not _differs(comparison, fit)]
-    return (
-        f"{text} On test queries, {first} and {', '.join(equal)} do not differ significantly."
-        if equal
-        else text
-    )
 
 
 def _error_table(comparison: Mapping[str, Any], titles: Mapping[str, str]) -> dict[str, Any]:

@@ -8,7 +8,6 @@ import re
 import shlex
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -159,8 +158,6 @@ NAMES = re.compile(r"^[a-z]+$")
 def output_of(words: list[str]) -> str | None:
     if "-o" in words:
         return words[words.index("-o") + 1]
-    if "--write" in words:
-        return f"{Path(words[words.index('--write') + 1]).parent}/"
     name = words[1] if NAMES.match(words[1]) else ""
     return None if "--dry-run" in words else DEFAULTS.get(words[0], {}).get(name)
 
@@ -177,11 +174,10 @@ def test_inputs_exist_and_no_output_folder_belongs_to_two_commands() -> None:
         for shown in in_blocks(page.read_text(), page.name):
             words = shlex.split(shown.text)
             output = output_of(words)
-            written = [after for flag, after in pairwise(words) if flag == "--write"]
             for word in words[1:]:
                 # A folder, or a file of one.
                 known = word in made or f"{Path(word).parent}/" in made or (ROOT / word).exists()
-                new = word not in (output, *written) and not known
+                new = word != output and not known
                 if new and word.endswith(("/", ".txt", ".yaml")):
                     faults.append(f"{shown.where}: {shown.text}: nothing made {word}")
             if output and made.setdefault(output, configuration(shown.text)) != configuration(shown.text):

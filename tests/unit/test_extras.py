@@ -19,16 +19,12 @@ from mbtf_core.extras import EXTRAS, import_extra
 from mbtf_core.run.cluster import open_runner
 from mbtf_fit.backends.shader.slang import SlangCompiler
 from mbtf_fit.export import gltf, materialx, usd
-from mbtf_fit.training.fit_folder import EventLog
-from mbtf_gen.measured.exported import export_neumip
 from mbtf_gen.measured.hdf5 import hdf5_file
 from mbtf_gen.publishing.croissant import croissant_text
 from mbtf_gen.publishing.formats import write_parquet
 from mbtf_pipeline.compare import perceptual_metrics
 
 EXPORT: Any = SimpleNamespace(shared={})
-SQUARE = SimpleNamespace(aspect=1.0, finest=3)
-DATA: Any = SimpleNamespace(layout="shuffled", lattice=SQUARE, shards=lambda split: [])
 
 
 def export(target: Any) -> Callable[[Path], object]:
@@ -54,7 +50,6 @@ USES: list[tuple[str, Callable[[Path], object]]] = [
     ("dask_jobqueue", workers("slurm")),
     ("distributed", workers("local")),
     ("fsspec", lambda folder: open_store("s3://bucket/data")),
-    ("h5py", lambda folder: export_neumip(DATA, folder / "data.h5")),
     ("h5py", lambda folder: hdf5_file(folder / "data.h5").__enter__()),
     ("mlcroissant", lambda folder: croissant_text(EXPORT)),
     ("pxr", export(usd)),
@@ -63,7 +58,6 @@ USES: list[tuple[str, Callable[[Path], object]]] = [
     ("s3fs", lambda folder: open_store("s3://bucket/data")),
     ("slangpy", lambda folder: SlangCompiler()),
     ("stlpips_pytorch", lambda folder: perceptual_metrics.require()),
-    ("tensorboard", EventLog),
 ]
 
 

@@ -50,14 +50,10 @@ async function show(content) {
     requestAnimationFrame(loop);
   };
   requestAnimationFrame(loop);
-  return viewer;
 }
 
 byId("canvas").addEventListener("webglcontextlost", () =>
   fail(new Error("The graphics card was reset. Load the page again.")),
 );
 window.addEventListener("error", (event) => fail(event.error ?? new Error(event.message)));
-if (CONTENT.live) {
-  byId("message").textContent = "Waiting for the first material …";
-  follow((material) => show({ ...CONTENT, materials: [material] }));
-} else show(CONTENT).catch(fail);
+show(CONTENT).catch(fail);

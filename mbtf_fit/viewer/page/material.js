@@ -65,13 +65,6 @@ class Material {
     return this.programs[key];
   }
 
-  delete() {
-    const { gl } = this;
-    for (const texture of Object.values(this.textures)) gl.deleteTexture(texture.handle);
-    for (const program of Object.values(this.programs)) gl.deleteProgram(program.handle);
-    if (this.buffer) gl.deleteBuffer(this.buffer);
-  }
-
   use(program, values, textures = {}) {
     const { gl } = this;
     program.use({ min_cos: this.content.min_cos, ...values });

@@ -53,19 +53,14 @@ function bindPanel(viewer) {
 
   for (const name of NAMES.shape) if (name) option(byId("shape"), name, name);
   for (const name of NAMES.name) if (name) option(byId("environment"), name, name);
-  // What can be shown and compared; more comes while fits are trained.
-  viewer.choicesChanged = () => {
-    for (const id of ["material", "against"]) byId(id).replaceChildren();
-    option(byId("against"), "none", "nothing");
-    viewer.materials.forEach((material, k) => {
-      option(byId("material"), k, material.name);
-      option(byId("against"), `material ${k}`, material.name);
-    });
-    viewer.pictures.forEach((picture, k) => option(byId("against"), `picture ${k}`, picture.name));
-    byId("material").parentElement.hidden = viewer.materials.length < 2;
-    byId("against_label").hidden = viewer.materials.length < 2 && !viewer.pictures.length;
-    refresh();
-  };
+  option(byId("against"), "none", "nothing");
+  viewer.materials.forEach((material, k) => {
+    option(byId("material"), k, material.name);
+    option(byId("against"), `material ${k}`, material.name);
+  });
+  viewer.pictures.forEach((picture, k) => option(byId("against"), `picture ${k}`, picture.name));
+  byId("material").parentElement.hidden = viewer.materials.length < 2;
+  byId("against_label").hidden = viewer.materials.length < 2 && !viewer.pictures.length;
 
   bind(
     "shape",
@@ -147,7 +142,6 @@ function bindPanel(viewer) {
     () => state.exposure ?? 0,
     (x) => {
       state.exposure = x;
-      viewer.automatic = false;
       viewer.redraw();
       viewer.saveLater();
     },
@@ -247,7 +241,7 @@ function bindPanel(viewer) {
   bindDivider(viewer);
   bindCanvas(viewer);
   new ResizeObserver(() => viewer.layout()).observe(canvas.parentElement);
-  viewer.choicesChanged();
+  refresh();
 }
 
 // Values over all lights and views at a place of the picture, of the material that is shown there.

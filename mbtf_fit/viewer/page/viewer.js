@@ -33,11 +33,10 @@ class Viewer {
     Object.assign(camera, new Camera(state.camera));
     camera.elevation = Math.max(camera.elevation, this.lowest);
     state.material = clamp(Math.round(state.material), 0, this.materials.length - 1);
-    // While a fit is trained, what is compared may come later.
-    if (!this.content.live && !this.picture && !this.shown[1]) state.against = "none";
-    Object.assign(this, { chosen: 0, automatic: false, swing: undefined });
-    // A link shows what its author chose. Drawing would slow down a fit that is running.
-    if (fragment.length < 2 && !this.content.live && !matchMedia("(prefers-reduced-motion: reduce)").matches)
+    if (!this.picture && !this.shown[1]) state.against = "none";
+    Object.assign(this, { chosen: 0, swing: undefined });
+    // A link shows what its author chose.
+    if (fragment.length < 2 && !matchMedia("(prefers-reduced-motion: reduce)").matches)
       this.swing = performance.now();
     this.shapeChanged();
     this.environmentChanged();
@@ -54,26 +53,6 @@ class Viewer {
         for (let c = 0; c < 3; c++)
           values[4 * ((rows - 1 - j) * columns + i) + c] = planes[c][j * columns + i] ** 2;
     return { ...picture, rows, columns, values };
-  }
-
-  // A material that is new, or takes the place of the one of its name.
-  async setMaterial(content) {
-    const material = await Material.load(this.renderer.gl, content),
-      known = this.materials.findIndex((m) => m.name === material.name);
-    if (known < 0) this.materials.push(material);
-    else {
-      this.materials[known].delete();
-      this.materials[known] = material;
-    }
-    // The first materials of a fit may be much darker or brighter than the last.
-    if (this.automatic) this.state.exposure = null;
-    this.choicesChanged();
-    this.changed();
-  }
-
-  async setPictures(pictures) {
-    this.pictures = await Promise.all(pictures.map((picture) => this._picture(picture)));
-    this.choicesChanged();
   }
 
   get material() {
@@ -273,7 +252,6 @@ class Viewer {
     const bright = values.sort((a, b) => a - b)[Math.round(0.95 * (values.length - 1))],
       stops = bright > 0 ? clamp(Math.log2(0.8 / bright), ...RANGES.exposure) : 0;
     this.state.exposure = Math.round(100 * stops) / 100;
-    this.automatic = true;
     this.refresh?.();
   }
 

@@ -76,18 +76,14 @@ def seam_warning(path: Path, seams: Sequence[Seam], factor: float) -> str | None
     )
 
 
-def orientation_warning(fit: NormalFit, normal: Path, height: Path) -> str | None:
-    """The warning that the normal map matches the heights only when turned, mirrored or inverted."""
-    if not fit.misfit:
+def inversion_warning(fit: NormalFit | None, path: Path) -> str | None:
+    """The warning that the normal map matches the inverted heights."""
+    if fit is None or not fit.inverted:
         return None
-    found = f"correlation of their slopes {fit.best:.2f}, against {fit.as_is:.2f} as given"
-    if not fit.turn:
-        return (
-            f"{normal}: fits the heights only upside down ({found}); "
-            "if dark is high, give a negative --height-scale"
-        )
-    which, other = (height, normal) if fit.image == "height" else (normal, height)
-    return f"{which}: fits {other.name} only when {fit.turn} ({found}); turn it, or one of the two is wrong"
+    return (
+        f"{path}: fits the heights only upside down (correlation of their slopes {fit.as_is:.2f}); "
+        "if dark is high, give a negative --height-scale"
+    )
 
 
 def choose_convention(

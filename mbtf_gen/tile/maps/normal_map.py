@@ -1,10 +1,9 @@
-"""Comparison of a normal map with its height map: convention, orientation, scale.
+"""Comparison of a normal map with its height map: convention, scale.
 
 A normal map usually repeats the slopes of its height map. We compare the slopes of the normals,
 ``t = (-n_x/n_z, -n_y/n_z)``, with those of the heights, ``s = (∂h/∂u, ∂h/∂y)``, y = a·v. Their correlation
-over all texels and both components, ``Σ s·t / √(Σ s² Σ t²)``, is near 1 where they agree. We evaluate it for
-all likely errors: one image turned or mirrored (the eight symmetries of a square), an inverted green channel
-(DirectX), inverted heights.
+over all texels and both components, ``Σ s·t / √(Σ s² Σ t²)``, is near 1 where they agree. It also tells an
+inverted green channel (DirectX) and inverted heights.
 
 Some maps store x and y alone: two-channel compression (BC5), and x in alpha, y in green (DXT5nm).
 """
@@ -12,9 +11,8 @@ Some maps store x and y alone: two-channel compression (BC5), and x in alpha, y 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,25 +22,14 @@ from mbtf_gen.tile.heights import HeightGrid, height_slopes, normal_slopes
 from mbtf_gen.tile.maps.file_names import Convention
 
 Array = NDArray[np.floating[Any]]
-Turned = Literal["height", "normal"] | None
 
-# Rotations and mirrorings of an image, as displayed.
-SYMMETRIES: dict[str, Callable[[Array], Array]] = {
-    "turned by 90 degrees counter-clockwise": lambda a: np.rot90(a, 1),
-    "turned by 180 degrees": lambda a: np.rot90(a, 2),
-    "turned by 90 degrees clockwise": lambda a: np.rot90(a, 3),
-    "mirrored left to right": lambda a: np.flip(a, 1),
-    "mirrored top to bottom": lambda a: np.flip(a, 0),
-    "transposed": lambda a: np.swapaxes(a, 0, 1),
-    "transposed along the other diagonal": lambda a: np.swapaxes(np.rot90(a, 2), 0, 1),
-}
-# Texels across, at most, that orientations are compared at, and that the scale is fitted at.
+# Texels across, at most, that decide, and that the scale is fitted at.
 _COMPARED, _FITTED = 512, 2048
+# Slopes of DirectX over those of OpenGL, along u and y.
+_DX = np.array([1.0, -1.0])[:, None, None]
 # The data decide where a correlation exceeds the first number and its rival by the second; of n texels, no
 # less than chance allows (multiples of 1/√n).
 _CLEAR, _AHEAD = (0.3, 8.0), (0.1, 4.0)
-# Correlations so close are one.
-_TIE = 1e-6
 _FLATTEST = 0.1
 _SMALLEST = 4
 # Blue is no z where it differs from √(1 - x² - y²), on average, by more than its own standard deviation and
@@ -63,20 +50,15 @@ class NormalFit:
 
     Attributes
     ----------
-    correlation_u, correlation_v : correlation of the slopes along u and along v, of the unchanged images in
-        the OpenGL convention; NaN where either has no slopes
-    gl, dx : correlation over both components of the unchanged images, in the OpenGL and the DirectX
-        convention
+    correlation_u, correlation_v : correlation of the slopes along u and along v, in the OpenGL convention;
+        NaN where either has no slopes
+    gl, dx : correlation over both components, in the OpenGL and the DirectX convention
     convention : {"gl", "dx"} or None, the convention with the clearly larger correlation; None if the data do
         not decide
-    fits : whether the unchanged images clearly match
-    misfit : whether they clearly match only after one is rotated or mirrored, or the heights are inverted
-    image : {"height", "normal"} or None, image to be rotated or mirrored for the best match. With None, a
-        misfit means inverted heights.
-    turn : how it is to be rotated or mirrored: a key of :data:`SYMMETRIES`, or empty
-    best : correlation of the best match
-    scale : height scale in tile widths (signed) whose slopes fit the normals of the unchanged images best in
-        the better convention (least squares)
+    fits : whether the images clearly match
+    inverted : whether they clearly match only with inverted heights
+    scale : height scale in tile widths (signed) whose slopes fit the normals best in the better convention
+        (least squares)
     """
 
     correlation_u: float
@@ -85,15 +67,12 @@ class NormalFit:
     dx: float
     convention: Convention | None
     fits: bool
-    misfit: bool
-    image: Turned
-    turn: str
-    best: float
+    inverted: bool
     scale: float
 
     @property
     def as_is(self) -> float:
-        """Correlation of the images as they are, in the better of the two conventions."""
+        """Correlation in the better of the two conventions."""
         return max(self.gl, self.dx)
 
 
@@ -114,23 +93,19 @@ def fit_normals(height: Array, normal: Array) -> NormalFit | None:
     """Compare a normal map (h, w, 3), unit vectors with y along v, with the stored heights (H, W) of the same
     tile, both box-filtered to the coarser resolution. None if either is flat, or has fewer than 4 texels
     along a side."""
-    fitted = _common(height, normal, _FITTED)
-    if min(fitted[0].shape) < _SMALLEST:
+    fitted, (h, n) = (_common(height, normal, limit) for limit in (_FITTED, _COMPARED))
+    if min(h.shape) < _SMALLEST:
         return None
     s, t = slopes_of_heights(fitted[0]), slopes_of_normals(fitted[1])
     if not _energy(s) > 0 or not _energy(t) > 1e-9 * t.size:
         return None
-    h, n = _common(height, normal, _COMPARED)
-    guesses = _guesses(h, n)
-    gl, dx, highest = guesses[0][0], guesses[1][0], max(score for score, _, _ in guesses)
-    # Symmetric tiles match in several ways: of the best ones, the most likely.
-    best, image, turn = next(guess for guess in guesses if guess[0] >= highest - _TIE)
-    here = max(gl, dx)
+    stored, claimed = slopes_of_heights(h), slopes_of_normals(n)
+    gl, dx = _correlation(stored, claimed), _correlation(stored, claimed * _DX)
+    here, inverse = max(gl, dx), max(-gl, -dx)
     clear, ahead = (max(low, factor / math.sqrt(h.size)) for low, factor in (_CLEAR, _AHEAD))
-    misfit = highest >= clear and highest - here >= ahead
-    fits = here >= clear and not misfit
+    inverted = inverse >= clear and inverse - here >= ahead
+    fits = here >= clear and not inverted
     better: Convention = "gl" if gl >= dx else "dx"
-    sign = np.array([1.0, 1.0 if better == "gl" else -1.0])[:, None, None]
     return NormalFit(
         correlation_u=_correlation(s[0], t[0]),
         correlation_v=_correlation(s[1], t[1]),
@@ -138,11 +113,8 @@ def fit_normals(height: Array, normal: Array) -> NormalFit | None:
         dx=dx,
         convention=better if fits and abs(gl - dx) >= ahead else None,
         fits=fits,
-        misfit=misfit,
-        image=image,
-        turn=turn,
-        best=best,
-        scale=float((s * t * sign).sum() / _energy(s)),
+        inverted=inverted,
+        scale=float((s * t * (1.0 if better == "gl" else _DX)).sum() / _energy(s)),
     )
 
 
@@ -161,29 +133,6 @@ def _energy(slopes: Array) -> float:
 def _correlation(s: Array, t: Array) -> float:
     norm = math.sqrt(_energy(s) * _energy(t))
     return float((s * t).sum()) / norm if norm > 0 else float("nan")
-
-
-def _guesses(height: Array, normal: Array) -> list[tuple[float, Turned, str]]:
-    """Every candidate (correlation, image to turn, how), the more likely ones first.
-
-    The first two are the unchanged images in the OpenGL and the DirectX convention; then inverted heights.
-    """
-    s, t = slopes_of_heights(height), slopes_of_normals(normal)
-    norm = math.sqrt(_energy(s) * _energy(t))
-
-    def scores(a: Array, b: Array) -> tuple[float, float]:
-        along_u, along_v = float((a[0] * b[0]).sum()), float((a[1] * b[1]).sum())
-        return (along_u + along_v) / norm, (along_u - along_v) / norm
-
-    gl, dx = scores(s, t)
-    out: list[tuple[float, Turned, str]] = [(score, None, "") for score in (gl, dx, -gl, -dx)]
-    for turn, move in SYMMETRIES.items():
-        if move(height).shape != height.shape:
-            continue
-        # Pixels are turned, their vectors are not; slopes of turned heights follow.
-        out += [(score, "height", turn) for score in scores(slopes_of_heights(move(height)), t)]
-        out += [(score, "normal", turn) for score in scores(s, np.stack([move(t[0]), move(t[1])]))]
-    return out
 
 
 def stored_xy(vectors: Array) -> tuple[list[int], str] | None:

@@ -7,18 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.fit_data import parallax, write_data
 from support.material_cases import CASES, make
 from support.plugin_materials import write_material
 from support.viewer_page import Page
 
 from mbtf_core.directions import from_angles
 from mbtf_core.pictures import Camera
-from mbtf_fit import fit
-from mbtf_fit.config import FitConfig
-from mbtf_fit.data.queries import ShardQueries
-from mbtf_fit.training.trainer import Trainer
-from mbtf_fit.viewer.live import LiveView
 from mbtf_fit.viewer.page import as_read, encode, material_content, pack_textures, write_page
 
 
@@ -104,39 +98,3 @@ def test_surroundings_light_a_plane(driver: Any, tmp_path: Path) -> None:
     page.js("window.mbtf.viewer.state.lights.length = 0")
     assert page.picture(64, 96)[..., :3].mean() == pytest.approx(0.2, rel=0.03)
     assert page.faults() == []
-
-
-def test_a_page_follows_a_fit(driver: Any, tmp_path: Path) -> None:
-    """Curve, levels and the material as they come, and what is there after the end."""
-    shards = write_data(tmp_path / "shards", parallax, train=3000, test=300, noise=0.01)
-    config = FitConfig.model_validate({"model": "neumip", "training": {"steps": 60, "batch": 512}})
-    live = LiveView("a fit")
-    page = Page(driver, "", tmp_path)
-    driver.get(live.url)
-    page.until(lambda: page.message().startswith("Waiting"))
-    live.stage("fit", "running")
-    seen = []
-    observe = live.observer("first")
-
-    def watch(record: dict[str, Any], trainer: Trainer, subset: ShardQueries) -> None:
-        observe(record, trainer, subset)
-        seen.append(record)
-
-    result = fit(config, shards, tmp_path / "material", observe=watch)
-    live.finished("first", tmp_path / "material")
-    live.finished("again", tmp_path / "material")
-    live.close()
-    page.ready()
-    page.until(lambda: page.js("return window.mbtf.viewer.materials.length") == 2)
-    text = page.js("return document.getElementById('curve_text').textContent")
-    assert f"first: step {seen[-1]['step']}, 100%" in text
-    assert "ended" in text
-    assert page.js("return document.getElementById('stages').textContent") == "fitrunning"
-    assert "level" in page.js("return document.getElementById('levels').textContent")
-    names = "return [...document.getElementById('material').options].map((o) => o.text)"
-    assert page.js(names) == ["first", "again"]
-    assert page.js("return window.mbtf.viewer.material.content.facts['training steps']") == 60
-    # What was shown last is the exported material.
-    tests = page.js("return window.mbtf.viewer.materials.map((m) => m.content.conformance.rgb)")
-    assert tests == [encode(result.material.conformance["rgb"])] * 2
-    assert driver.find_element("id", "curve").is_displayed()

@@ -12,7 +12,7 @@ from support.commands import Done, run_named
 
 # Quadrants of the map: top left, top right, bottom left, bottom right.
 QUADRANTS = {"red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "white": (1, 1, 1)}
-FAST = "--size 96 --spp 4 --set queries.train=3000"
+FAST = "--size 96 --spp 4"
 
 
 def write_inputs(folder: Path) -> None:

@@ -15,13 +15,12 @@ from mbtf_pipeline.cli.app import app
 RECIPE = """
 name: test
 library: [materials]
-training: 1s
 base:
   generate:
     queries: {train: 100/texel, resolution: 8, test: "1024", test_spp: 16, min_cos: 0.3}
     light: {width: 10}
   fit:
-    neumip: {training: {batch: 1024}}
+    neumip: {training: {time: 1s, batch: 1024}}
   compare:
     views: [{elevation: 60, azimuth: -90}]
     lights: [{elevation: 50, azimuth: 45}]

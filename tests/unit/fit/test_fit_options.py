@@ -82,9 +82,7 @@ def test_a_held_out_direction_lies_on_the_disk() -> None:
     [
         ("", "no shards given"),
         ("a --many b", "--many replaces the argument SHARDS"),
-        ("--many a --dry-run", "--dry-run takes one data set"),
         ("a --cluster local", "--cluster requires --many"),
-        ("--many a --processes 2 --cluster local", "--cluster sets the processes"),
     ],
 )
 def test_one_fit_and_several_have_options_of_their_own(

@@ -83,8 +83,6 @@ def test_a_run_states_its_cost_and_is_refused_if_the_disk_is_full(
     assert run(app, ["run", str(FILE), "-o", str(out)]) == 130
     said = capsys.readouterr().err
     assert "expected: about 3:" in said
-    # Three drafts of 800 steps may take longer.
-    assert "faster" not in said
     disk.free = 1e6
     assert run(app, ["run", str(FILE), "-o", str(out)]) == 3
     problem, hint = capsys.readouterr().err.splitlines()
@@ -92,29 +90,11 @@ def test_a_run_states_its_cost_and_is_refused_if_the_disk_is_full(
     assert "--set" in hint
     assert not out.exists()
     with pytest.raises(InputError, match="holds no run"):
-        forecast_left(load_recipe(FILE), ROOT / "pipelines", lambda: load_recipe(FILE))
+        forecast_left(load_recipe(FILE), ROOT / "pipelines")
 
 
-def test_a_draft_is_suggested_where_its_steps_take_less_on_slow_machines(
-    disk: SimpleNamespace, one: Path
-) -> None:
-    """800 of them, of a tenth of a second."""
-
-    def suggested(seconds: int) -> str | None:
-        text = ONE.replace("neumip}", f"neumip, training: {{time: {seconds}s}}}}")
-        one.write_text(text.replace("npy,", "npy, queries: {resolution: 64, train: 100/texel},"))
-        recipe, draft = preset_recipe(one, None), preset_recipe(one, "draft")
-        return forecast_left(recipe, one.parent / "none", lambda: draft)
-
-    short, long = suggested(30), suggested(200)
-    assert short is not None
-    assert long is not None
-    assert "faster" not in short
-    assert long.endswith("; faster: --quality draft")
-
-
-def test_a_draft_that_is_resumed_has_less_to_do(disk: SimpleNamespace, one: Path) -> None:
-    """Its data are there; another draft is no faster than it."""
+def test_a_run_that_is_resumed_has_less_to_do(disk: SimpleNamespace, one: Path) -> None:
+    """Its data are there."""
     recipe, folder = preset_recipe(one, "draft", ["fit.training.time=5min"]), one.parent / "run"
     folder.mkdir()
     write_run_record(folder, recipe, "command")
@@ -124,4 +104,4 @@ def test_a_draft_that_is_resumed_has_less_to_do(disk: SimpleNamespace, one: Path
     run_stages(folder, [replace(first, outputs=(), run=lambda decision: None)])
     left = RunForecaster(recipe).of(recipe, [stage.name for stage in others])
     assert (left.start, left.generating) == (2.5, 0.0)
-    assert forecast_left(recipe, folder, lambda: recipe) == left.describe()
+    assert forecast_left(recipe, folder) == left.describe()

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.folder import DataFolder
-from mbtf_fit.config import FitConfig
-from mbtf_fit.training.next_step import NextStep, next_step
+from mbtf_fit.training.next_step import next_step
 from mbtf_fit.training.validation import FLAT, MarginalCost, caveat, marginal_cost_of
 
 
@@ -181,31 +177,3 @@ UNKNOWN = {"test": {"n": 8, "unexplained": {"value": None, "error": None}}}
 )
 def test_the_next_step_is_what_pays_most(cost: MarginalCost, errors: dict[str, Any], kind: str) -> None:
     assert next_step(cost, errors).kind == kind
-
-
-def test_the_next_command_is_complete(tmp_path: Path) -> None:
-    """Twice of what was given, four times the test queries, in new folders."""
-    queries = {"train": "50/texel", "test": "8192"}
-    manifest: dict[str, Any] = {"config": {"material": "wool maps", "queries": queries}, "layout": "shuffled"}
-    data = Dataset(DataFolder.open(tmp_path / "shards"), manifest)
-
-    def command(kind: Any, material: str = "material", seconds: float = 30.1, **training: Any) -> str:
-        config = FitConfig.model_validate({"training": {"time": "30s", **training}})
-        found = NextStep(kind, "").command(config, seconds, data, Path(material))
-        return str(found).replace(f"{tmp_path}/", "")
-
-    fitted = "--config material/config.yaml"
-    assert command("time") == f"mbtf-fit shards {fitted} --time 1min -o material-2"
-    # The fewest steps took longer than the time.
-    assert command("time", seconds=41.0) == f"mbtf-fit shards {fitted} --time 90s -o material-2"
-    assert command("time", steps=300) == f"mbtf-fit shards {fitted} --steps 600 -o material-2"
-    made = "mbtf-gen 'wool maps' --config shards/config.yaml"
-    again = f"mbtf-fit shards-2 {fitted} -o material-2"
-    assert command("queries") == f"{made} --queries 100/texel -o shards-2 && {again}"
-    more = "--queries 1 --test-queries 32768"
-    assert command("test") == f"{made} {more} -o shards-2 && mbtf-fit evaluate material shards-2"
-    # The digits of a name count nothing; a second sequel does.
-    for name, following in (("b2_500", "b2_500-2"), ("m-2/", "m-3"), ("m-64", "m-64-2")):
-        assert command("time", name).endswith(f" -o {following}")
-    manifest["config"] = {"material": "wool maps"}
-    assert command("none") == command("queries") == "None"

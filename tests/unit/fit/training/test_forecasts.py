@@ -1,4 +1,4 @@
-"""Forecasts of fits, which write nothing; validations; an error that ends training."""
+"""Validations; an error that ends training."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import pytest
 from support.fit_data import parallax, write_data
 
 import mbtf_fit.training.fit as fits
-import mbtf_fit.training.forecast as module
 import mbtf_fit.training.validation as validation
 from mbtf_fit import fit
 from mbtf_fit.config import FitConfig
@@ -16,7 +15,6 @@ from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.endings import reached
-from mbtf_fit.training.forecast import forecast_fit
 from mbtf_fit.training.suitable_data import open_data
 from mbtf_fit.training.validation import validation_set
 
@@ -53,25 +51,6 @@ def test_training_stops_once_the_error_is_reached(
     # Without an error to reach, fits are what they were, and no other configuration.
     assert reached(config(), found.history) is None
     assert "error" not in config().fields()["training"]
-
-
-@pytest.mark.parametrize("options", [{"time": "3s"}, {"steps": 12}])
-def test_a_forecast_matches_the_fit_that_follows(
-    shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, object]
-) -> None:
-    monkeypatch.setattr(module, "_PILOT_SECONDS", 0.1)
-    monkeypatch.setattr(module, "_PIECE_SECONDS", 0.05)
-    config = FitConfig.model_validate({"training": {"batch": 500, "warmup": 3, **options}})
-    before = sorted(tmp_path.rglob("*")), sorted(shards.rglob("*"))
-    found = forecast_fit(config, shards)
-    assert (sorted(tmp_path.rglob("*")), sorted(shards.rglob("*"))) == before
-    assert found.steps == pytest.approx(found.seconds * found.queries_per_second / 500, abs=0.5)
-    assert found.seconds == 3.0 if "time" in options else found.steps == 12
-    if "steps" in options:
-        fit(config, shards, tmp_path / "material")
-        # Names and shapes stand before the numbers, conformance queries beside them.
-        size = (tmp_path / "material" / "weights.safetensors").stat().st_size
-        assert found.bytes < size < found.bytes + 20480
 
 
 def test_validation_uses_a_large_split(shards: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""HDF5 of NeuMIP and NeuralBTF: conventions, exports, and files that are refused."""
+"""HDF5 of NeuMIP and NeuralBTF: conventions, and files that are refused."""
 
 from __future__ import annotations
 

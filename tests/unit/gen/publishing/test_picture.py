@@ -23,7 +23,7 @@ def test_images_have_v_and_the_light_where_they_belong(tmp_path: Path) -> None:
 
     write_data(tmp_path / "data", value, train=60_000, test=10, finest=4)
     arrays = Dataset.open(tmp_path / "data").load("train")
-    tile = tile_image(arrays, 1.0, None)
+    tile = tile_image(arrays, 1.0)
     at = (np.arange(len(tile)) + 0.5) / len(tile)
     wave = np.broadcast_to(1.0 + 0.5 * np.sin(2 * np.pi * at), tile.shape[:2])
     np.testing.assert_allclose(tile[..., 0], wave, atol=0.1)
@@ -43,7 +43,7 @@ def test_highlights_that_few_queries_see_are_no_specks(tmp_path: Path) -> None:
     arrays = Dataset.open(tmp_path / "data").load("train")
     for key in ("value_a", "value_b"):
         arrays[key] = np.where(np.arange(20_000)[:, None] % 500 == 0, 100.0, arrays[key])
-    assert np.nanmax(tile_image(arrays, 1.0, None)) < 0.16
+    assert np.nanmax(tile_image(arrays, 1.0)) < 0.16
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

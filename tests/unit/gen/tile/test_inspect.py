@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from support.height_maps import fractal, normals_of, save_heights, save_normals
 from support.mitsuba_shapes import tile_mesh
 
-from mbtf_core.app.console import run
-from mbtf_core.config.yaml_file import read_yaml
-from mbtf_gen.cli.app import app
-from mbtf_gen.config.generator import GeneratorConfig, GeometrySection
-from mbtf_gen.job import Job
+from mbtf_gen.config.generator import GeometrySection
 from mbtf_gen.tile.heights import HeightGrid, rms_slope, triangle_slopes
 from mbtf_gen.tile.inspection import inspection_text
 from mbtf_gen.tile.loading import load_material
@@ -65,55 +60,3 @@ class TestNumbers:
         assert found["maps"]["height"]["columns"] == shape[1]
         assert found["normal"] is not None
         assert f"columns {shape[1]}" in " ".join(inspection_text(found, "tiny").split())
-
-
-# Height scale of the normal map, and the one that it suggests: 8-bit normals of gentle slopes are rounded.
-SCALE = 0.0123
-STORED = 0.012
-
-
-@pytest.fixture
-def maps(tmp_path: Path) -> Path:
-    """Maps that do not tile, with a DirectX normal map: three quarters of a periodic tile."""
-    out = tmp_path / "maps"
-    out.mkdir()
-    height = fractal(128, 128)
-    save_heights(out / "height.png", height[:96, :96])
-    # The cut tile is three quarters as wide: heights in its widths are 4/3 as high.
-    save_normals(out / "normal.png", normals_of(height, 0.75 * SCALE)[:96, :96], dx=True)
-    np.save(out / "color.npy", np.full((96, 96, 3), 120, np.uint8))
-    return out
-
-
-def job_of(material: Path, **sections: Any) -> Job:
-    return Job.load(GeneratorConfig.model_validate({"material": str(material), **sections}))
-
-
-def written(folder: Path, *flags: str, file: str = "material.yaml") -> dict[str, Any]:
-    assert run(app, ["inspect", str(folder), "--write", str(folder / file), *flags]) == 0
-    return dict(read_yaml(folder / file))
-
-
-class TestWrite:
-    def test_what_the_material_file_says(self, maps: Path) -> None:
-        text = "height: {file: height.png, scale: 0.2}\nmake_tileable: none\nresolution: 8\nroughness: 0.4\n"
-        (maps / "material.yaml").write_text(text)
-        content = written(maps, "--overwrite")
-        assert content == {
-            "height": {"file": "height.png", "scale": 0.2},
-            "roughness": {"value": 0.4},
-            "make_tileable": "none",
-            "resolution": 8,
-        }
-
-    def test_the_other_commands_need_no_flags(self, maps: Path) -> None:
-        geometry = {"height_scale": STORED, "make_tileable": "blend"}
-        flagged = job_of(maps, geometry=geometry, queries={"resolution": 16})
-        written(maps, "--resolution", "16")
-        plain = job_of(maps)
-        assert np.array_equal(plain.material.grid.z, flagged.material.grid.z)
-        for role in ("base_color", "normal"):
-            assert np.array_equal(plain.material.maps[role], flagged.material.maps[role])
-        assert plain.lattice == flagged.lattice
-        assert plain.config.geometry == flagged.config.geometry
-        assert plain.config.queries == flagged.config.queries

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from mbtf_pipeline.cost import measurement, plan
+from mbtf_pipeline.cost import measurement
 
 
 @pytest.fixture(autouse=True)
 def free_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     """No probe of the processors: this machine gets all of them."""
-    for module in (measurement, plan):
-        monkeypatch.setattr(module, "processor_share", lambda: 1.0)
+    monkeypatch.setattr(measurement, "processor_share", lambda: 1.0)

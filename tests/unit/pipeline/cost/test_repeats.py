@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from support.fake_runs import TRUE, FakeRuns, MemoryStore, conditions, run
 
-from mbtf_core.run.runner import Runner
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.cost import measurement as module
 from mbtf_pipeline.cost.measurement import (
@@ -36,7 +35,7 @@ def repeat(monkeypatch: pytest.MonkeyPatch) -> Repeat:
 
     def measured(store: MemoryStore, fake: FakeRuns, most: int = 10**6) -> Any:
         monkeypatch.setattr(Run, "measure", lambda run, conditions: fake.measure(run))
-        found = Measurements(conditions(), store, Runner())  # type: ignore[arg-type]
+        found = Measurements(conditions(), store)  # type: ignore[arg-type]
         planned = [replace(run, seed=seed) for seed in range(2) for run in RUNS]
         found.measure_runs(planned, lambda run: len(fake.measured) < most)
         return [found.group(run) for run in RUNS]
