@@ -23,6 +23,7 @@ EXTRAS = {
     "s3fs": ("stores", "s3fs"),
     "slangpy": ("shaders", "slangpy"),
     "stlpips_pytorch": ("perceptual", "stlpips-pytorch"),
+    "tensorboard": ("tensorboard", "tensorboard"),
 }
 
 

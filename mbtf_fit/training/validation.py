@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.stats import (
+    by_group,
+    level_groups,
     unexplained_variance,
 )
 from mbtf_fit.data.loader import Partition, load_split
@@ -47,6 +49,18 @@ def validation_subset(positions: int, queries: ShardQueries) -> ShardQueries:
     return queries.take(np.arange(0, len(queries), max(1, math.ceil(len(queries) / most))))
 
 
+def finite(number: float | None) -> float | None:
+    """A number, or None where it is not finite; JSON and plots have no others."""
+    return number if number is not None and math.isfinite(number) else None
+
+
+def errors_by_level(trainer: Trainer, queries: ShardQueries) -> dict[str, float | None]:
+    """Unexplained variance by nearest level; None where it is undefined."""
+    level = level_groups(queries.sigma, trainer.model.lattice.finest)
+    values = trainer.predict(queries), *queries.halves
+    return {str(s): finite(e.value) for s, e in by_group(unexplained_variance, level, *values).items()}
+
+
 def history_record(
     trainer: Trainer,
     subset: ShardQueries,
@@ -69,8 +83,7 @@ def history_record(
     if len(subset):
         found = unexplained_variance(prediction, *subset.halves).as_dict()
         if previous is not None:
-            error = excess_error([prediction], [previous], [subset]).error
-            change = error if math.isfinite(error) else None
+            change = finite(excess_error([prediction], [previous], [subset]).error)
     return {
         "step": state.step,
         "seconds": round(state.seconds, 3),
