@@ -21,6 +21,8 @@ from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
 # Depth below the lowest height at which rays end, as a share of the shell: the rounding of single precision.
 _MARGIN = 1e-3
+# Longest way of a ray through the shell, over that on a surface of equal curvature.
+ENTERED = 2.0
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,8 @@ class ShellHit:
     heights : heights of the intersections, one per place
     curvature, flat : of the surface; where it has none
     tilt : change of the normal's horizontal part from the top of the shell to there, an angle
-    leaves : whether the ray, reversed, passes the shell where the surface curves away from it
+    leaves : whether the ray, reversed, passes the shell where the surface curves away from it; its start, if
+        on the surface, is near
     omega_o : towards the viewer in the frame there, raised to the lowest directions with data where curved
     values : results of the operation ``trace``
     """
@@ -98,18 +101,21 @@ class Shell:
         omega_o: Vector3f,
         curvature: Vector3f,
         min_cos: Float,
+        distance: Float,
         over: Callable[[Vector2f], Vector3f],
     ) -> ShellHit:
-        """Trace view rays over a surface of curvatures (xx, xy, yy), in 1/tile width; `over` is the direction
-        towards the viewer in the frame at a tilt."""
+        """Trace view rays over a surface of curvatures (xx, xy, yy), in 1/tile width. They have come from a
+        distance in tile widths; `over` is the direction towards the viewer in the frame at a tilt."""
         curvature = mi.Vector3f(*rounded(curvature, self.depth))
         flat = (curvature.x == 0) & (curvature.y == 0) & (curvature.z == 0)
         arc = Arc.of(-omega_o, curvature, self.depth, float(self.op.crossings))
         lowest = clamped(omega_o, min_cos)
         found = []
         places = list(self.places(u, level, lowest))
-        for at, over_plane in zip(places, self.flat_heights(places, lowest, flat), strict=True):
-            hit, s, z = trace_arcs(self.heightfield, mi.Point2f(*at), arc, self.aspect, ~flat)
+        arcs = trace_arcs(self.heightfield, places, arc, self.aspect, ~flat)
+        for at, over_plane, (hit, s, z) in zip(
+            places, self.flat_heights(places, lowest, flat), arcs, strict=True
+        ):
             place = [
                 dr.select(flat, a, dr.fma(s, b, c))
                 for a, b, c in zip(
@@ -139,6 +145,7 @@ class Shell:
         still = flat | (omega_o.z <= 0.0)
         there = dr.select(still, omega_o, clamped(over(bend), min_cos))
         before = displaced([x, y], -z, there, self.aspect)
+        back = Arc.of(omega_o, curvature, self.depth, float(self.op.crossings))
         return ShellHit(
             self,
             count / len(found),
@@ -147,7 +154,7 @@ class Shell:
             curvature,
             flat,
             bend,
-            Arc.of(omega_o, curvature, self.depth, float(self.op.crossings)).passes,
+            back.passes & (distance < ENTERED * back.length),
             there,
             {self.op.output: [z], self.op.hits: hits},
         )
