@@ -51,8 +51,6 @@ class Arc:
     end : distance along the surface at which the rays end
     bend : an eighth of the largest second derivative of their height, at least 0
     cut : whether a ray ends at the longest distance that is traced
-    passes : whether it does not go as deep as the shell
-    length : of the ray in the shell
     """
 
     azimuth: Vector2f
@@ -62,8 +60,6 @@ class Arc:
     end: Float
     bend: Float
     cut: Mask
-    passes: Mask
-    length: Float
 
     @classmethod
     def of(cls, d: Vector3f, curvature: Vector3f, depth: Float, longest: float) -> Arc:
@@ -93,8 +89,6 @@ class Arc:
             mi.Float(0.0),
             mi.Float(0.0),
             mi.Bool(False),
-            to_bottom < 0.0,
-            last,
         )
         end = arc.position(last)
         cut = end > longest

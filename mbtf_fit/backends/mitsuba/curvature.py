@@ -16,7 +16,7 @@ import mitsuba as mi
 from mbtf_gen.engine.types import Float, SurfaceInteraction3f, Vector2f, Vector3f
 
 # Largest depth of a shell in radii of curvature: sharper edges are taken to be that round.
-DEEPEST = 0.5
+DEEPEST = 0.8
 
 
 def with_normal_partials(si: SurfaceInteraction3f, active: Any = True) -> SurfaceInteraction3f:

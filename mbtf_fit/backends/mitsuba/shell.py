@@ -21,8 +21,9 @@ from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
 # Depth below the lowest height at which rays end, as a share of the shell: the rounding of single precision.
 _MARGIN = 1e-3
-# Longest way of a ray through the shell, over that on a surface of equal curvature.
-ENTERED = 2.0
+# Largest depth of a ray that leaves the shell, over that of the shell. Over a sphere, it is a quarter of the
+# ray's length times its cosine, but curvature varies.
+DEEPER = 1.5
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,7 @@ class ShellHit:
     heights : heights of the intersections, one per place
     curvature, flat : of the surface; where it has none
     tilt : change of the normal's horizontal part from the top of the shell to there, an angle
-    leaves : whether the ray, reversed, passes the shell where the surface curves away from it; its start, if
-        on the surface, is near
+    leaves : whether the ray comes from the shell's top, which curves away from it
     omega_o : towards the viewer in the frame there, raised to the lowest directions with data where curved
     values : results of the operation ``trace``
     """
@@ -101,11 +101,12 @@ class Shell:
         omega_o: Vector3f,
         curvature: Vector3f,
         min_cos: Float,
-        distance: Float,
+        rise: Float,
         over: Callable[[Vector2f], Vector3f],
     ) -> ShellHit:
-        """Trace view rays over a surface of curvatures (xx, xy, yy), in 1/tile width. They have come from a
-        distance in tile widths; `over` is the direction towards the viewer in the frame at a tilt."""
+        """Trace view rays over a surface of curvatures (xx, xy, yy), in 1/tile width. Along the
+        normal, they come from a distance `rise` below. `over` is the direction towards the viewer in the
+        frame at a tilt."""
         curvature = mi.Vector3f(*rounded(curvature, self.depth))
         flat = (curvature.x == 0) & (curvature.y == 0) & (curvature.z == 0)
         arc = Arc.of(-omega_o, curvature, self.depth, float(self.op.crossings))
@@ -145,7 +146,6 @@ class Shell:
         still = flat | (omega_o.z <= 0.0)
         there = dr.select(still, omega_o, clamped(over(bend), min_cos))
         before = displaced([x, y], -z, there, self.aspect)
-        back = Arc.of(omega_o, curvature, self.depth, float(self.op.crossings))
         return ShellHit(
             self,
             count / len(found),
@@ -154,7 +154,7 @@ class Shell:
             curvature,
             flat,
             bend,
-            back.passes & (distance < ENTERED * back.length),
+            ~flat & (arc.curvature > 0.0) & (rise < 4.0 * DEEPER * self.depth),
             there,
             {self.op.output: [z], self.op.hits: hits},
         )
