@@ -21,9 +21,6 @@ from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
 # Depth below the lowest height at which rays end, as a share of the shell: the rounding of single precision.
 _MARGIN = 1e-3
-# Largest depth of a ray that leaves the shell, over that of the shell. Over a sphere, it is a quarter of the
-# ray's length times its cosine, but curvature varies.
-DEEPER = 1.5
 
 
 @dataclass(frozen=True)
@@ -154,7 +151,8 @@ class Shell:
             curvature,
             flat,
             bend,
-            ~flat & (arc.curvature > 0.0) & (rise < 4.0 * DEEPER * self.depth),
+            # Over a sphere, a ray is at most a quarter of its rise deep.
+            ~flat & (arc.curvature > 0.0) & (rise < 4.0 * self.depth),
             there,
             {self.op.output: [z], self.op.hits: hits},
         )
