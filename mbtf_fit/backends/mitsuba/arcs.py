@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from mbtf_gen.engine.types import Float, Mask, Point2f, Point3f, Vector2f, Vector3f
+from mbtf_gen.engine.types import Float, Mask, Point3f, Vector2f, Vector3f
 from mbtf_gen.tile.tracers.heightfield import HeightField
 from mbtf_gen.tile.tracers.heightfield_tracer import (
     Block,
@@ -51,7 +51,6 @@ class Arc:
     end : distance along the surface at which the rays end
     bend : an eighth of the largest second derivative of their height, at least 0
     cut : whether a ray ends at the longest distance that is traced
-    passes : whether it does not go as deep as the shell
     """
 
     azimuth: Vector2f
@@ -61,7 +60,6 @@ class Arc:
     end: Float
     bend: Float
     cut: Mask
-    passes: Mask
 
     @classmethod
     def of(cls, d: Vector3f, curvature: Vector3f, depth: Float, longest: float) -> Arc:
@@ -91,7 +89,6 @@ class Arc:
             mi.Float(0.0),
             mi.Float(0.0),
             mi.Bool(False),
-            to_bottom < 0.0,
         )
         end = arc.position(last)
         cut = end > longest
@@ -108,9 +105,12 @@ class Arc:
 
     def height(self, s: Float) -> Float:
         """Heights at distances along the surface."""
-        sin, cos = dr.sincos(0.5 * self.curvature * s)
-        p = 2.0 * sin * dr.fma(self.sine, sin, -self.cosine * cos)
-        return p / (self.curvature * (self.sine - p))
+        h = 0.5 * self.curvature * s
+        square = dr.square(h)
+        # tan h = a h/b, by Padé.
+        a, b = dr.fma(-2 / 21, square, 1.0), dr.fma(square, dr.fma(1 / 105, square, -3 / 7), 1.0)
+        p, r = a * h, b * self.cosine / self.sine
+        return a * s * (p - r) * dr.rcp(dr.fma(p, 2.0 * r - p, b * b))
 
     def slope(self, s: Float) -> Float:
         """Slopes of the ray, relative to the surface there, at distances along the surface."""
@@ -140,34 +140,43 @@ class ArcState:
 
 
 def trace_arcs(
-    heightfield: HeightField, u: Point2f, arc: Arc, aspect: float, active: Mask
-) -> tuple[Mask, Float, Float]:
+    heightfield: HeightField, places: Iterable[Iterable[Float]], arc: Arc, aspect: float, active: Mask
+) -> list[tuple[Mask, Float, Float]]:
     """First intersections of rays with the heights.
 
     Parameters
     ----------
     heightfield : of unit scale, in tile widths
-    u : points over which the rays start, uv
+    places : uv of points over which rays start, traced together
     arc : the rays
     aspect : height of the tile over its width
     active : lanes to trace
 
     Returns
     -------
-    (Mask, Float, Float)
+    list of (Mask, Float, Float)
         Whether a ray meets the heights; the distance along the surface and the height at which.
     """
-    ray = mi.Ray3f(on_top(u, aspect), mi.Vector3f(arc.azimuth.x, arc.azimuth.y, 0.0))
-    block, constants = start_traversal(heightfield, ray, mi.Bool(active), mi.Bool(False))
-    state = _follow(heightfield, ArcState(block, mi.Float(0.0)), constants, arc)
-    return _meet(heightfield, state, constants, arc, active)
+    along = mi.Vector3f(arc.azimuth.x, arc.azimuth.y, 0.0)
+    starts = [
+        start_traversal(heightfield, mi.Ray3f(on_top(u, aspect), along), mi.Bool(active), mi.Bool(False))
+        for u in places
+    ]
+    constants = starts[0][1]
+    states = [ArcState(block, mi.Float(0.0)) for block, _ in starts]
+    states = _follow(heightfield, states, constants, arc)
+    return [_meet(heightfield, state, constants, arc, active) for state in states]
 
 
 @dr.syntax
-def _follow(heightfield: HeightField, state: ArcState, constants: RayConstants, arc: Arc) -> ArcState:
-    while dr.hint(state.block.searching, exclude=[heightfield, constants, arc]):
-        state = _step(heightfield, state, constants, arc)
-    return state
+def _follow(
+    heightfield: HeightField, states: list[ArcState], constants: RayConstants, arc: Arc
+) -> list[ArcState]:
+    while dr.hint(
+        dr.any([state.block.searching for state in states], axis=0), exclude=[heightfield, constants, arc]
+    ):
+        states = [_step(heightfield, state, constants, arc) for state in states]
+    return states
 
 
 @dataclass(frozen=True)

@@ -162,9 +162,11 @@ class MbtfBSDF(mi.BSDF):
             return View(self, frame, u, level, wi, wi.z > 0)
         # The project's integrator gives them with the footprint.
         bent = si if footprints_provided.get() else with_normal_partials(si)
-        form = rounded(curvature(bent, self.uv_scale.x * self.uv_scale.y), self.shell.depth)
-        form = in_axes(form, frame.x, frame.y)
-        hit = self.shell.meet(u, level, wi, form, self.min_cos, lambda tilt: frame.over(tilt).to_tile(si.wi))
+        form = in_axes(rounded(curvature(bent, frame.width), self.shell.depth), frame.x, frame.y)
+        rise = -si.wi.z * si.t / frame.width
+        hit = self.shell.meet(
+            u, level, wi, form, self.min_cos, rise, lambda tilt: frame.over(tilt).to_tile(si.wi)
+        )
         frame = frame.over(hit.tilt)
         # Rays leave a mesh through its back, where shading normals of coarse ones may face them.
         front = dr.dot(si.n, si.to_world(si.wi)) > 0

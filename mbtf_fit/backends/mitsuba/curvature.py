@@ -16,7 +16,7 @@ import mitsuba as mi
 from mbtf_gen.engine.types import Float, SurfaceInteraction3f, Vector2f, Vector3f
 
 # Largest depth of a shell in radii of curvature: sharper edges are taken to be that round.
-DEEPEST = 0.5
+DEEPEST = 0.8
 
 
 def with_normal_partials(si: SurfaceInteraction3f, active: Any = True) -> SurfaceInteraction3f:
@@ -47,19 +47,19 @@ def with_normal_partials(si: SurfaceInteraction3f, active: Any = True) -> Surfac
     return si
 
 
-def curvature(si: SurfaceInteraction3f, area: Float) -> tuple[Float, Float, Float]:
+def curvature(si: SurfaceInteraction3f, width: Float) -> tuple[Float, Float, Float]:
     """Second fundamental form (xx, xy, yy) in the shading frame, times the tile's width: positive where the
     surface is convex.
 
     Parameters
     ----------
     si : with derivatives of the normal
-    area : area of a unit of uv in squared tile widths
+    width : of a tile
     """
     du, dv, nu, nv = (si.sh_frame.to_local(mi.Vector3f(w)) for w in (si.dp_du, si.dp_dv, si.dn_du, si.dn_dv))
     determinant = du.x * dv.y - du.y * dv.x
     inverse = dr.select(determinant != 0.0, dr.rcp(determinant), 0.0)
-    scale = inverse * dr.sqrt(dr.abs(determinant) / area)
+    scale = inverse * width
     xx = (nu.x * dv.y - nv.x * du.y) * scale
     yy = (nv.y * du.x - nu.y * dv.x) * scale
     xy = 0.5 * ((nv.x * du.x - nu.x * dv.x) + (nu.y * dv.y - nv.y * du.y)) * scale

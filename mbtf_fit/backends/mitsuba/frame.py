@@ -17,11 +17,13 @@ class Frame:
     """The tile's frame at hits: x and y are steps of the tile in the shading frame, in units in which they
     span an area of 1, as stretched and sheared as texture coordinates are. Directions of the tile are those
     in which rays cross its heights. It is upside down where side is -1; then tilted, over a curved surface.
+    The tile has a width on the surface.
     """
 
     x: Vector2f
     y: Vector2f
     side: Float
+    width: Float
     tilt: Vector2f | None = None
 
     @classmethod
@@ -34,7 +36,7 @@ class Frame:
         x = dr.select(good, mi.Vector2f(du.x, du.y) * unit, mi.Vector2f(1.0, 0.0))
         y = dr.select(good, mi.Vector2f(dv.x, dv.y) * unit, mi.Vector2f(0.0, 1.0))
         side = dr.select(si.wi.z < 0, mi.Float(-1.0), 1.0) if two_sided else mi.Float(1.0)
-        return cls(x, y, side)
+        return cls(x, y, side, dr.sqrt(area))
 
     def to_tile(self, w: Vector3f) -> Vector3f:
         """Local direction → the tile's."""

@@ -36,7 +36,7 @@ from mbtf_gen.engine.types import Color3f, Float, Mask, Normal3f, Point2f, Vecto
 # 0.26 to 0.36 in the mean, and 0.42 to 0.58 weighted by its distance. Depth of the surroundings of a high
 # place, as a share of the way down to the bottom.
 OCCLUDER, SURROUNDINGS = 0.4, 0.3
-# Least tangent and largest elevation of a horizon; largest distance to it in tile widths.
+# Least and largest elevation of a horizon; largest distance to it in tile widths.
 LEAST_HORIZON, HIGHEST, FARTHEST = 1e-3, 1.55, 1.0
 
 
@@ -92,12 +92,13 @@ class DirectLight:
         κ s²/2, and with it what shadows the place, which is nearer below the top. No horizon is below that
         of the surroundings."""
         height, bend = self.heights[place], self.bend
-        slope = dr.maximum(dr.tan(dr.minimum(plane, HIGHEST)), LEAST_HORIZON)
+        angle = dr.clip(plane, LEAST_HORIZON, HIGHEST)
+        slope = dr.tan(angle)
         distance = dr.minimum(-OCCLUDER * height / slope, FARTHEST)
         sunk = slope / dr.fma(bend, (1.0 - OCCLUDER) * height, 1.0) - 0.5 * bend * distance
         dip = self.dip(SURROUNDINGS * dr.maximum(self.depth + height, 0.0))
         bent = dr.maximum(sunk, -dip * dr.rsqrt(1.0 - dip * dip))
-        return dr.select(self.flat, plane, plane + dr.atan(bent) - dr.atan(slope))
+        return dr.select(self.flat, plane, plane + dr.atan(bent) - angle)
 
 
 @MITSUBA.implements(ops.Shade)

@@ -35,7 +35,7 @@ class ShellHit:
     heights : heights of the intersections, one per place
     curvature, flat : of the surface; where it has none
     tilt : change of the normal's horizontal part from the top of the shell to there, an angle
-    leaves : whether the ray, reversed, passes the shell where the surface curves away from it
+    leaves : whether the ray comes from the shell's top, which curves away from it
     omega_o : towards the viewer in the frame there, raised to the lowest directions with data where curved
     values : results of the operation ``trace``
     """
@@ -98,18 +98,22 @@ class Shell:
         omega_o: Vector3f,
         curvature: Vector3f,
         min_cos: Float,
+        rise: Float,
         over: Callable[[Vector2f], Vector3f],
     ) -> ShellHit:
-        """Trace view rays over a surface of curvatures (xx, xy, yy), in 1/tile width; `over` is the direction
-        towards the viewer in the frame at a tilt."""
+        """Trace view rays over a surface of curvatures (xx, xy, yy), in 1/tile width. Along the
+        normal, they come from a distance `rise` below. `over` is the direction towards the viewer in the
+        frame at a tilt."""
         curvature = mi.Vector3f(*rounded(curvature, self.depth))
         flat = (curvature.x == 0) & (curvature.y == 0) & (curvature.z == 0)
         arc = Arc.of(-omega_o, curvature, self.depth, float(self.op.crossings))
         lowest = clamped(omega_o, min_cos)
         found = []
         places = list(self.places(u, level, lowest))
-        for at, over_plane in zip(places, self.flat_heights(places, lowest, flat), strict=True):
-            hit, s, z = trace_arcs(self.heightfield, mi.Point2f(*at), arc, self.aspect, ~flat)
+        arcs = trace_arcs(self.heightfield, places, arc, self.aspect, ~flat)
+        for at, over_plane, (hit, s, z) in zip(
+            places, self.flat_heights(places, lowest, flat), arcs, strict=True
+        ):
             place = [
                 dr.select(flat, a, dr.fma(s, b, c))
                 for a, b, c in zip(
@@ -147,7 +151,8 @@ class Shell:
             curvature,
             flat,
             bend,
-            Arc.of(omega_o, curvature, self.depth, float(self.op.crossings)).passes,
+            # Over a sphere, a ray is at most a quarter of its rise deep.
+            ~flat & (arc.curvature > 0.0) & (rise < 4.0 * self.depth),
             there,
             {self.op.output: [z], self.op.hits: hits},
         )

@@ -52,7 +52,7 @@ def test_facets_reflect_as_they_lie_on_the_surface(
     flat = facets(tmp_path / "tile", np.eye(2), layers).evaluate(u, sigma, *tile)
     evaluator = Evaluator(read_material(tmp_path / "tile"))
     light, view = (mi.Vector3f(w.astype(np.float32).T) for w in tile)
-    frame = Frame(*(mi.Vector2f(*column.tolist()) for column in stretch.T), mi.Float(1.0))
+    frame = Frame(*(mi.Vector2f(*column.tolist()) for column in stretch.T), mi.Float(1.0), mi.Float(1.0))
     level = evaluator.level(mi.Float(sigma.astype(np.float32)))
     values = evaluator.stage1(mi.Point2f(u.astype(np.float32).T), level, view)
     found = np.array(evaluator.value(values, light, frame=frame)).T
@@ -73,7 +73,7 @@ def test_slopes_at_a_height_are_those_of_the_offset_surface(stretch: np.ndarray)
     along, across = ((point(step * e) - point(-step * e)) / (2 * step) for e in np.eye(2))
     normal = np.cross(along, across)
     expected = -normal[:2] / normal[2]
-    frame = Frame(*(mi.Vector2f(*column.tolist()) for column in stretch.T), mi.Float(1.0))
+    frame = Frame(*(mi.Vector2f(*column.tolist()) for column in stretch.T), mi.Float(1.0), mi.Float(1.0))
     form = stretch.T @ curved @ stretch
     sag = mi.Vector3f(*(height * form[[0, 0, 1], [0, 1, 1]]).tolist())
     found, flat = (np.array(frame.slope(mi.Vector2f(*s.tolist()), x)).ravel() for x in (sag, None))
@@ -96,7 +96,7 @@ def test_facets_at_a_depth_are_steeper_over_a_cylinder(tmp_path: Path) -> None:
     values = evaluator.stage1(mi.Point2f(u.astype(np.float32).T), level, view)
     form, heights = mi.Vector3f(kappa, 0.0, 0.0), [mi.Float(height)] * 4
     lit = DirectLight(light, mi.Float(0.1), mi.Bool(False), form, mi.Float(0.25), heights)
-    frame = Frame(mi.Vector2f(1, 0), mi.Vector2f(0, 1), mi.Float(1.0))
+    frame = Frame(mi.Vector2f(1, 0), mi.Vector2f(0, 1), mi.Float(1.0), mi.Float(1.0))
     found = np.array(evaluator.value(values, light, lit, frame)).T
     assert deviation(plain, wanted) > 0.03
     assert deviation(found, wanted) < 1e-3
