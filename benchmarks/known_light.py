@@ -75,9 +75,9 @@ class TracedHints:
         from mbtf_gen.render.estimates import Stream
 
         found = estimator.estimate(
-            Queries(*(q.numpy() for q in queries)), self.paths, Stream(7, "train", self.calls)
+            Queries(*(q.cpu().numpy() for q in queries)), self.paths, Stream(7, "train", self.calls)
         )
-        return torch.from_numpy(0.5 * (found.value_a + found.value_b))
+        return torch.from_numpy(0.5 * (found.value_a + found.value_b)).to(queries[0].device)
 
 
 def measure(name: str, folder: Path, steps: int, paths: int, known: str) -> dict[str, Any]:

@@ -16,9 +16,7 @@ def evaluate(
     """Measure the errors of a material, free of the data's noise.
 
     The predictions of other code are evaluated too. Measured data have one value per query: errors on them
-    include their noise, and say so.
-
-    It ends with the command that is expected to reduce the error most.
+    include their noise, and say so. Advice on what reduces the error comes last.
 
     No fit is trained on test queries and held-out directions. --verbose adds the training queries, and
     errors by level of detail and by elevation.

@@ -159,7 +159,7 @@ def output_of(words: list[str]) -> str | None:
     if "-o" in words:
         return words[words.index("-o") + 1]
     name = words[1] if NAMES.match(words[1]) else ""
-    return None if "--dry-run" in words else DEFAULTS.get(words[0], {}).get(name)
+    return DEFAULTS.get(words[0], {}).get(name)
 
 
 def configuration(text: str) -> str:

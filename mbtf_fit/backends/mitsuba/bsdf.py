@@ -163,13 +163,13 @@ class MbtfBSDF(mi.BSDF):
         # The project's integrator gives them with the footprint.
         bent = si if footprints_provided.get() else with_normal_partials(si)
         form = in_axes(rounded(curvature(bent, frame.width), self.shell.depth), frame.x, frame.y)
-        rise = -si.wi.z * si.t / frame.width
+        # Rays leave a mesh through its back, where shading normals of coarse ones may face them.
+        front = dr.dot(si.n, si.to_world(si.wi)) > 0
+        rise = dr.select(front, 0.0, -si.wi.z * si.t / frame.width)
         hit = self.shell.meet(
             u, level, wi, form, self.min_cos, rise, lambda tilt: frame.over(tilt).to_tile(si.wi)
         )
         frame = frame.over(hit.tilt)
-        # Rays leave a mesh through its back, where shading normals of coarse ones may face them.
-        front = dr.dot(si.n, si.to_world(si.wi)) > 0
         return View(self, frame, hit.u, level, hit.omega_o, front & (wi.z > 0), hit)
 
     def sample(

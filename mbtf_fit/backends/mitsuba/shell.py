@@ -151,7 +151,8 @@ class Shell:
             curvature,
             flat,
             bend,
-            # Over a sphere, a ray is at most a quarter of its rise deep.
+            # Over a sphere, a ray gets at least a quarter of its rise deep, at most half: some pass that
+            # met the bottom; none stays that left.
             ~flat & (arc.curvature > 0.0) & (rise < 4.0 * self.depth),
             there,
             {self.op.output: [z], self.op.hits: hits},

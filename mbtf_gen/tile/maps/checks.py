@@ -81,7 +81,7 @@ def inversion_warning(fit: NormalFit | None, path: Path) -> str | None:
     if fit is None or not fit.inverted:
         return None
     return (
-        f"{path}: fits the heights only upside down (correlation of their slopes {fit.as_is:.2f}); "
+        f"{path}: fits the heights only upside down (correlation of their slopes {min(fit.gl, fit.dx):.2f}); "
         "if dark is high, give a negative --height-scale"
     )
 
