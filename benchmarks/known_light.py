@@ -3,14 +3,10 @@
     python benchmarks/known_light.py --out FOLDER [CLOTH ...] [--steps 400] [--paths 32]
 
 At 64 texels, 200 queries per texel of 4 paths. Hints of the known surface are replaced, for training and
-test queries, by what the generator traces along so many paths through each footprint:
-
-- ``visibility``: the share of the direct light that shadows leave;
-- ``reflection``: direct light without shadows;
-- ``direct``: direct light.
-
-With the last, interreflection remains, noise of the hints, and what the network does not learn in these
-steps. FOLDER keeps data and figures, so the same command resumes. The last line is one JSON object.
+test queries, by what the generator traces along so many paths through each footprint: the ``visibility`` of
+the light, direct light without shadows (``reflection``), or ``direct`` light. With the last, interreflection
+remains, noise of the hints, and what the network does not learn in these steps. FOLDER keeps data and
+figures, so the same command resumes. The last line is one JSON object.
 """
 
 from __future__ import annotations
@@ -33,7 +29,7 @@ from mbtf_gen.job import Job
 
 KNOWN = ("nothing", "visibility", "reflection", "direct")
 QUERIES = {"train": "200/texel", "test": "32768", "spp": 4, "test_spp": 32, "test_highlights": 0.75}
-# Columns of the hints that visibility scales: irradiance and core.
+# Columns of the hints: irradiance and core, which visibility scales, and core.
 SCALED, CORE = [1, 4, 5, 6], slice(4, 7)
 RESOLUTION, LEAST = 64, 1e-3
 
@@ -56,40 +52,34 @@ class TracedHints:
         self.known, self.paths, self.calls, self.hints = known, paths, 0, material.compute_hints
 
     def __call__(self, surface: Any, trace: Any, shade: Any, fibers: Any, *queries: torch.Tensor) -> Any:
+        from mbtf_gen.render.estimates import Stream
+
         hints = self.hints(surface, trace, shade, fibers, *queries)
         self.calls += 1
-        if self.known in ("reflection", "direct"):
-            hints[:, CORE] = self._traced(getattr(self, self.known), queries)
+        asked, stream = Queries(*(q.numpy() for q in queries)), Stream(7, "train", self.calls)
+        found = (e.estimate(asked, self.paths, stream) for e in (self.reflection, self.direct))
+        reflection, direct = (torch.from_numpy(0.5 * (e.value_a + e.value_b)) for e in found)
         if self.known == "visibility":
             u, sigma, omega_i, omega_o = queries
             level = (-torch.log2(2.0 * sigma)).clamp(0.0, float(surface.lattice.finest))
             _, hit = surface.intersections(trace, u, level, omega_o)
-            assumed = surface.visibility(shade, hit[:, :2], level + shade.finer, omega_i)
-            direct, reflection = (self._traced(e, queries).sum(1) for e in (self.direct, self.reflection))
-            share = direct / reflection.clamp_min(LEAST)
-            hints[:, SCALED] *= share[:, None] / assumed.clamp_min(LEAST)
+            assumed = surface.visibility(shade, hit, level, omega_i).clamp_min(LEAST)
+            hints[:, SCALED] *= (direct.sum(1) / reflection.sum(1).clamp_min(LEAST))[:, None] / assumed
+        elif self.known != "nothing":
+            hints[:, CORE] = direct if self.known == "direct" else reflection
         return hints
-
-    def _traced(self, estimator: Any, queries: tuple[torch.Tensor, ...]) -> torch.Tensor:
-        """Means (n, 3) of paths through the footprints; equal paths for both estimators of a call."""
-        from mbtf_gen.render.estimates import Stream
-
-        found = estimator.estimate(
-            Queries(*(q.cpu().numpy() for q in queries)), self.paths, Stream(7, "train", self.calls)
-        )
-        return torch.from_numpy(0.5 * (found.value_a + found.value_b)).to(queries[0].device)
 
 
 def measure(name: str, folder: Path, steps: int, paths: int, known: str) -> dict[str, Any]:
     """Unexplained variance of a fit that knows so much."""
     config = generator_config(name, "draft", RESOLUTION)
     config = config.model_copy(update={"queries": config.queries.model_copy(update=QUERIES)})
-    data, job = folder / "shards", Job.load(config)
-    generate(config, data)
+    generate(config, folder / "shards")
     training = {"steps": steps, "batch": 16384, "importance_sampling": False}
-    options = FitConfig.model_validate({"model": "cloth", "training": training})
-    with patch.object(material, "compute_hints", TracedHints(job, known, paths)):
-        return dict(fit(options, data, folder / "fit", overwrite=True).errors["test"]["unexplained"])
+    options = FitConfig.model_validate({"model": "cloth", "device": "cpu", "training": training})
+    with patch.object(material, "compute_hints", TracedHints(Job.load(config), known, paths)):
+        result = fit(options, folder / "shards", folder / "fit", overwrite=True)
+    return dict(result.errors["test"]["unexplained"])
 
 
 def main() -> int:
@@ -97,15 +87,13 @@ def main() -> int:
     parser.add_argument("materials", nargs="*", metavar="CLOTH")
     parser.add_argument("--out", type=Path, required=True, help="folder of data and figures")
     parser.add_argument("--steps", type=int, default=400)
-    parser.add_argument("--paths", type=int, default=32, help="paths of each hint")
-    arguments = parser.parse_args()
-    figures: dict[str, dict[str, Any]] = {}
-    for name in arguments.materials or CLOTHS:
-        folder, steps, paths = arguments.out / name, arguments.steps, arguments.paths
+    parser.add_argument("--paths", type=int, default=32, help="paths of each hint, an even number")
+    options = parser.parse_args()
+    figures: dict[str, Any] = {}
+    for name in options.materials or CLOTHS:
+        folder, sizes = options.out / name, (options.steps, options.paths)
         figures[name] = {
-            known: kept(
-                folder / f"{known}-{steps}-{paths}.json", partial(measure, name, folder, steps, paths, known)
-            )
+            known: kept(folder / f"{known}-{sizes}.json", partial(measure, name, folder, *sizes, known))
             for known in KNOWN
         }
         errors = (f"{e['value']:.3f} ± {e['error']:.3f}" for e in figures[name].values())
