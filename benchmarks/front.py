@@ -117,9 +117,8 @@ OVER_NEUMIP = 1.2
 def shards(name: str, folder: Path) -> Path:
     """Data of a material, generated where they are missing."""
     out = folder / name / "shards"
-    config = generator_config(name, "draft", RESOLUTION)
-    queries = config.queries.model_copy(update={"test_spp": TEST_SPP, "test_highlights": HIGHLIGHTS})
-    generate(config.model_copy(update={"queries": queries}), out)
+    test = {"test_spp": TEST_SPP, "test_highlights": HIGHLIGHTS}
+    generate(generator_config(name, "draft", RESOLUTION, **test), out)
     return out
 
 

@@ -45,35 +45,38 @@ class TracedHints:
         from mbtf_gen.sampling.light_kernel import LightKernel
 
         tile, light = build_scene(job.material, job.material.surface()), LightKernel(job.config.light.width)
-        self.reflection, self.direct = (
-            Estimator(tile, light, Transport(interreflection=False, bsdf_sampling=False, shadowing=on))
-            for on in (False, True)
-        )
+        self.estimators = {
+            known: Estimator(tile, light, Transport(interreflection=False, bsdf_sampling=False, shadowing=on))
+            for known, on in (("reflection", False), ("direct", True))
+        }
         self.known, self.paths, self.calls, self.hints = known, paths, 0, material.compute_hints
 
     def __call__(self, surface: Any, trace: Any, shade: Any, fibers: Any, *queries: torch.Tensor) -> Any:
-        from mbtf_gen.render.estimates import Stream
-
         hints = self.hints(surface, trace, shade, fibers, *queries)
         self.calls += 1
-        asked, stream = Queries(*(q.numpy() for q in queries)), Stream(7, "train", self.calls)
-        found = (e.estimate(asked, self.paths, stream) for e in (self.reflection, self.direct))
-        reflection, direct = (torch.from_numpy(0.5 * (e.value_a + e.value_b)) for e in found)
         if self.known == "visibility":
             u, sigma, omega_i, omega_o = queries
             level = (-torch.log2(2.0 * sigma)).clamp(0.0, float(surface.lattice.finest))
             _, hit = surface.intersections(trace, u, level, omega_o)
             assumed = surface.visibility(shade, hit, level, omega_i).clamp_min(LEAST)
-            hints[:, SCALED] *= (direct.sum(1) / reflection.sum(1).clamp_min(LEAST))[:, None] / assumed
+            direct, reflection = (self._traced(known, queries).sum(1) for known in ("direct", "reflection"))
+            hints[:, SCALED] *= (direct / reflection.clamp_min(LEAST))[:, None] / assumed
         elif self.known != "nothing":
-            hints[:, CORE] = direct if self.known == "direct" else reflection
+            hints[:, CORE] = self._traced(self.known, queries)
         return hints
+
+    def _traced(self, known: str, queries: tuple[torch.Tensor, ...]) -> torch.Tensor:
+        """Means (n, 3) of paths through the footprints; those of one call have equal random numbers."""
+        from mbtf_gen.render.estimates import Stream
+
+        asked, stream = Queries(*(q.numpy() for q in queries)), Stream(7, "train", self.calls)
+        found = self.estimators[known].estimate(asked, self.paths, stream)
+        return torch.from_numpy(0.5 * (found.value_a + found.value_b))
 
 
 def measure(name: str, folder: Path, steps: int, paths: int, known: str) -> dict[str, Any]:
     """Unexplained variance of a fit that knows so much."""
-    config = generator_config(name, "draft", RESOLUTION)
-    config = config.model_copy(update={"queries": config.queries.model_copy(update=QUERIES)})
+    config = generator_config(name, "draft", RESOLUTION, **QUERIES)
     generate(config, folder / "shards")
     training = {"steps": steps, "batch": 16384, "importance_sampling": False}
     options = FitConfig.model_validate({"model": "cloth", "device": "cpu", "training": training})

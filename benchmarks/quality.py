@@ -19,7 +19,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 from common import HEIGHT_SCALES, finish, is_available, parser_of, source, start
 
@@ -99,8 +99,8 @@ def resolution_of(quality: Quality, resolution: int | None) -> int:
     return int(resolution or GENERATOR[quality][RESOLUTION])
 
 
-def generator_config(name: str, quality: Quality, resolution: int) -> GeneratorConfig:
-    """Configuration of the generator for a material at a preset."""
+def generator_config(name: str, quality: Quality, resolution: int, **queries: Any) -> GeneratorConfig:
+    """Configuration of the generator for a material at a preset, with some options of the queries."""
     material, height = source(name)
     return resolve(
         GeneratorConfig,
@@ -109,6 +109,7 @@ def generator_config(name: str, quality: Quality, resolution: int) -> GeneratorC
             "material": str(material),
             "geometry.height_scale": height,
             "queries.resolution": resolution,
+            **{f"queries.{name}": value for name, value in queries.items()},
         },
     )
 

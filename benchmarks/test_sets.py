@@ -38,13 +38,12 @@ THRESHOLDS = {"relative_error": 0.05, "standard_errors": STANDARD_ERRORS}
 
 def test_set(name: str, folder: Path, share: float, paths: float, spp: int) -> dict[str, Any]:
     """Error of a material's fit on one test set of so many paths, its pilot included, `spp` per query."""
-    config = generator_config(name, "draft", RESOLUTION)
     pilot = min(PILOT_SHARE / (1.0 + PILOT_SHARE) * paths, PILOT_MOST * PILOT_SPP) if share else 0.0
     count = round((paths - pilot) / spp)
     options = {"train": "2", "test": str(count), "test_spp": spp, "test_highlights": share}
     out = folder / f"test-{share:g}-{paths:g}-{spp}"
     began = time.process_time()
-    generate(config.model_copy(update={"queries": config.queries.model_copy(update=options)}), out)
+    generate(generator_config(name, "draft", RESOLUTION, **options), out)
     seconds = time.process_time() - began
     test = load_split(Dataset.open(out), "test")
     predicted = Material.load(folder / "fit").predict(test)
@@ -56,11 +55,7 @@ def trained(name: str, folder: Path, steps: int) -> None:
     """Fit a material, unless it is fitted."""
     if (folder / "fit" / "material.json").exists():
         return
-    config = generator_config(name, "draft", RESOLUTION)
-    options = {"train": TRAIN, "test": "1024"}
-    generate(
-        config.model_copy(update={"queries": config.queries.model_copy(update=options)}), folder / "train"
-    )
+    generate(generator_config(name, "draft", RESOLUTION, train=TRAIN, test="1024"), folder / "train")
     model = CLOTH_MODELS["relief"] if name in CLOTHS else RELIEF
     settings = deep_merge(model, {"training": {"steps": steps}})
     fit(FitConfig.model_validate(settings), folder / "train", folder / "fit", overwrite=True)
