@@ -1,12 +1,13 @@
 """``mbtf_path``: a path tracer with ray cones, which give ``mbtf`` its footprint at every hit.
 
-A cone has a width, the side of the square that a pixel covers across the ray, and a spread, by which the
+A cone has a width, the side of the square that a sample covers across the ray, and a spread, by which the
 width grows per unit of length (Amanatides 1984; Akenine-Möller et al. 2019). The initial values are the
-sensor's ray differentials of whole pixels. At a hit its footprint is the projection of the square
-onto the surface, as it is from Mitsuba 3.10 on where camera rays of its own integrators hit. The curvature of
-surfaces is neglected. The spread of a scattered ray's cone is bounded below by the density of its direction.
+sensor's ray differentials, which Mitsuba divides by √samples: each of the jittered samples of a pixel stands
+for its share of the area, and a picture is not blurred twice. At a hit its footprint is the projection of the
+square onto the surface, as it is from Mitsuba 3.10 on where camera rays of its own integrators hit. The
+curvature of surfaces is neglected. The spread of a scattered ray's cone is bounded below by the density of its direction.
 
-At grazing angles a pixel's footprint is an ellipse, while those of materials are round. An elongated Gaussian
+At grazing angles such a footprint is an ellipse, while those of materials are round. An elongated Gaussian
 is the mean of narrow ones along its major axis, so every hit on a surface's material looks up one of them at
 random: the mean over samples has the elongated footprint, at the cost of one lookup each.
 """
@@ -101,12 +102,11 @@ def narrow_footprint(
     return si
 
 
-def camera_cone(ray: Ray3f, samples: int) -> tuple[Float, Float]:
-    """(width, spread) of a sensor's ray, whose differentials Mitsuba has divided by √samples."""
-    scale = float(samples) ** 0.5
+def camera_cone(ray: Ray3f) -> tuple[Float, Float]:
+    """(width, spread) of a sensor's ray."""
     width = dr.cross(ray.o_x - ray.o, ray.o_y - ray.o)
     spread = dr.cross(ray.d_x - ray.d, ray.d_y - ray.d)
-    return tuple(scale * dr.sqrt(dr.abs(dr.dot(area, ray.d))) for area in (width, spread))
+    return tuple(dr.sqrt(dr.abs(dr.dot(area, ray.d))) for area in (width, spread))
 
 
 def surfaces_of(scene: Scene) -> tuple[bool, bool, list[Any]]:
@@ -163,7 +163,7 @@ class ConePath(mi.SamplingIntegrator):
         self, scene: Scene, sampler: Sampler, ray: Ray3f, medium: Any = None, active: Mask = True
     ) -> tuple[Spectrum, Mask, list[Float]]:
         """Radiance along a camera ray, whether it hit a surface, no further channels."""
-        width, spread = camera_cone(ray, sampler.sample_count())
+        width, spread = camera_cone(ray)
         token = footprints_provided.set(True)
         try:
             cone = (mi.Ray3f(ray), width, spread)

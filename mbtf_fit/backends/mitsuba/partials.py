@@ -1,13 +1,12 @@
-"""The footprint of a hit: uv of the sides of the parallelogram that a pixel covers.
+"""The footprint of a hit: uv of the sides of the parallelogram that a sample of a pixel covers.
 
 Mitsuba from 3.10 on projects the cones of camera rays onto surfaces. ``si.footprint`` is a matrix of these
-sides as columns, times ``si.footprint_scale`` for one of the jittered samples of a pixel. Scenes compute it
-where a texture asks to be filtered. Earlier, ``si.duv_dx`` and ``si.duv_dy`` are fields that nothing sets.
+sides as columns. Scenes compute it where a texture asks to be filtered. Earlier, ``si.duv_dx`` and
+``si.duv_dy`` are fields that nothing sets.
 """
 
 from __future__ import annotations
 
-import drjit as dr
 import mitsuba as mi
 
 from mbtf_gen.engine.types import SurfaceInteraction3f, Vector2f
@@ -28,16 +27,13 @@ def uv_partials(si: SurfaceInteraction3f) -> tuple[Vector2f, Vector2f]:
     """Both sides, 0 where no footprint is known."""
     if not hasattr(si, "footprint"):
         return si.duv_dx, si.duv_dy
-    scale = mi.Float(getattr(si, "footprint_scale", 1.0))
     x, y = (mi.Vector2f(si.footprint[0, k], si.footprint[1, k]) for k in (0, 1))
-    return dr.select(scale > 0.0, x / scale, x), dr.select(scale > 0.0, y / scale, y)
+    return x, y
 
 
 def set_uv_partials(si: SurfaceInteraction3f, dx: Vector2f, dy: Vector2f) -> None:
-    """Write both sides of a whole pixel."""
+    """Write both sides."""
     if not hasattr(si, "footprint"):
         si.duv_dx, si.duv_dy = dx, dy
         return
     si.footprint = mi.Matrix2f(dx.x, dy.x, dx.y, dy.y)
-    if hasattr(si, "footprint_scale"):
-        si.footprint_scale = 1.0
