@@ -5,7 +5,8 @@ width grows per unit of length (Amanatides 1984; Akenine-Möller et al. 2019). T
 sensor's ray differentials, which Mitsuba divides by √samples: each of the jittered samples of a pixel stands
 for its share of the area, and a picture is not blurred twice. At a hit its footprint is the projection of the
 square onto the surface, as it is from Mitsuba 3.10 on where camera rays of its own integrators hit. The
-curvature of surfaces is neglected. The spread of a scattered ray's cone is bounded below by the density of its direction.
+curvature of surfaces is neglected. The spread of a scattered ray's cone is bounded below by the density of
+its direction.
 
 At grazing angles such a footprint is an ellipse, while those of materials are round. An elongated Gaussian
 is the mean of narrow ones along its major axis, so every hit on a surface's material looks up one of them at
