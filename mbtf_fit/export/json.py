@@ -33,7 +33,7 @@ def write(export: Export, options: None) -> list[str]:
     weights, expected = material.model.weights(), dict(material.conformance)
     through, textures = material.transmittance, grouped(weights) if export.form in QUANTIZED else {}
     ranges = {
-        texture: _numbers(range_of([weights[name].cpu().numpy() for name in names]))
+        texture: _numbers(range_of(texture, [weights[name].cpu().numpy() for name in names]))
         for texture, names in textures.items()
     }
     if through is not None:

@@ -26,7 +26,7 @@ from mbtf_fit.material.texture_formats import (
     encode_blocks,
     round_levels,
 )
-from mbtf_fit.ops.constants import HEIGHTS
+from mbtf_fit.ops.constants import HEIGHTS, MAPS
 
 SHAPES = [(1, 1), (2, 2), (3, 5), (8, 8), (24, 32)]
 
@@ -69,6 +69,17 @@ def test_the_error_is_half_a_step_and_rounding_again_changes_nothing(form: Textu
     (found,) = round_levels(HEIGHTS, [heights], form)
     assert np.abs(found - heights).max() <= 0.5001 / 65535
     assert found.max() == heights.max()
+
+
+@pytest.mark.parametrize("form", QUANTIZED)
+def test_few_steep_texels_leave_the_other_moments_their_steps(form: TextureFormat) -> None:
+    levels = [np.random.default_rng(n).random((n, n, 8), np.float32) for n in (16, 32)]
+    levels[1][:2, :2, 2:] = 100.0
+    rounded = round_levels(MAPS, levels, form)
+    apart = np.abs(levels[0] - rounded[0]).reshape(-1, 8).max(0)
+    assert apart[2:5].max() < 0.02 < apart[5:].max()
+    again = round_levels(MAPS, rounded, form)
+    assert all(np.array_equal(a, b) for a, b in zip(rounded, again, strict=True))
 
 
 @pytest.mark.parametrize("form", QUANTIZED)
