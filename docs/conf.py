@@ -33,7 +33,8 @@ templates_path: list[str] = []
 
 html_theme = "furo"
 html_title = "mbtf"
-html_static_path: list[str] = []
+html_static_path = ["extensions/formulas.css"]
+html_css_files = ["formulas.css"]
 html_theme_options = {"navigation_with_keys": True}
 
 autodoc_typehints = "signature"
@@ -90,7 +91,11 @@ def _entries_without_types(
 
 def _mathml(writer: Any, node: Any, display: str) -> None:
     """Formulas as MathML, which browsers show by themselves: pages load nothing from elsewhere."""
-    writer.body.append(latex2mathml.converter.convert(node.astext(), display=display))
+    formula = latex2mathml.converter.convert(node.astext(), display=display)
+    # Browsers know bold letters, but not the attribute.
+    bold = re.compile(r'<mi mathvariant="bold">([a-z])</mi>')
+    formula = bold.sub(lambda found: f"<mi>{chr(0x1D41A + ord(found[1]) - ord('a'))}</mi>", formula)
+    writer.body.append(formula)
     raise nodes.SkipNode
 
 

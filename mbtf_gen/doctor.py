@@ -88,7 +88,7 @@ def _cuda() -> str:
 
 
 def use_torch() -> Iterator[dict[str, str]]:
-    """PyTorch takes a derivative."""
+    """PyTorch takes a derivative; is the compiled kernel there?"""
     # By name: this package does not depend on PyTorch, but the fitter in the same installation does.
     torch: Any = import_module("torch")
     device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -96,7 +96,9 @@ def use_torch() -> Iterator[dict[str, str]]:
     (weight - 1).square().sum().backward()
     if weight.grad.item() != -2.0:
         raise EngineError(f"a derivative is {weight.grad.item()} instead of -2")
-    yield {"found": f"{torch.__version__} on {device}, took a derivative"}
+    compiled = import_module("mbtf_fit.native.library").kernel() is not None
+    speed = "" if compiled or device == "cuda" else "; without the compiled kernel, fits take longer"
+    yield {"found": f"{torch.__version__} on {device}, took a derivative{speed}"}
 
 
 def use_kernel_cache() -> Iterator[dict[str, str]]:

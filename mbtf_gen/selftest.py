@@ -52,7 +52,7 @@ def verdict(tolerance: float, cases: Mapping[str, Case]) -> str:
     name = max(good, key=lambda n: (not good[n], abs(cases[n].off) / (limits[n] or 1.0)))
     off, error = cases[name]
     random = f" ± {error:.1e}" if error else ""
-    found = f"off by {abs(off):.1e}{random} of at most {tolerance:.1e} ({name}; {len(cases)} cases)"
+    found = f"off by {abs(off):.1e}{random} of at most {limits[name]:.1e} ({name}; {len(cases)} cases)"
     if not all(good.values()):
         raise EngineError(found)
     return found

@@ -190,7 +190,7 @@ def content_of(material: Material, name: str, packed: dict[str, PackedTexture]) 
         "facts": {
             "levels": f"0 to {material.lattice.finest}",
             "network weights": sum(p.numel() for p in material.model.parameter_groups()[1]),
-            "texels": sum(p.numel() for p in material.model.parameter_groups()[0]),
+            "texture values": sum(p.numel() for p in material.model.parameter_groups()[0]),
             "training steps": training.get("steps"),
             "training time in s": training.get("seconds"),
         },
