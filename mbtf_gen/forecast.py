@@ -44,7 +44,6 @@ class Forecast:
     seconds, seconds_se : of sampling, tracing and writing all queries with compiled kernels, and the standard
         error
     start : seconds of loading, compiling and the pilot's first piece
-    query_seconds : seconds per training query
     paths : of all splits, including the queries' own pilots under a target error
     paths_per_query : mean over the training split, without pilots
     bytes : of all shards
@@ -55,7 +54,6 @@ class Forecast:
     seconds: float
     seconds_se: float
     start: float
-    query_seconds: float
     paths: int
     paths_per_query: float
     bytes: int
@@ -141,7 +139,6 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
         seconds=total.value,
         seconds_se=total.error,
         start=start,
-        query_seconds=path.value * per_query,
         paths=paths,
         paths_per_query=lights * sum(map(stored, found)) / len(a),
         bytes=data_bytes(job, job.shards),

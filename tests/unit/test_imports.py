@@ -25,7 +25,7 @@ ROOMS = {
     " checks doctor,selftest job planning forecast generation pictures publishing cli .",
     "mbtf_fit": "sections formatting ops data native surface pytorch objective backends.cpu models config"
     " material evaluation training backends.mitsuba backends.shader preview comparison viewer export cli .",
-    "mbtf_pipeline": "recipe compare stages tables report run collection forecast cost cli .",
+    "mbtf_pipeline": "recipe compare stages tables report run collection cost cli .",
 }
 RANK = {
     f"{package}.{name}".removesuffix(".."): rank
