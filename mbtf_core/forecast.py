@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
-import statistics
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from mbtf_core.run.task import available_cores, worker_threads
 from mbtf_core.stats import Estimate
 
 # Fewest timed pieces of a pilot.
 FEWEST_PIECES = 3
 # Work of more seconds or bytes is announced before it begins.
 LONG, LARGE = 60.0, 1e9
-# Wall time of a probe of the processors, seconds, and bytes of its steps, which run without Python's lock.
-_PROBE_SECONDS, _PROBE_BYTES = 0.05, 1 << 20
 
 
 def pilot_seconds(piece: Callable[[int], float], seconds: float) -> Estimate:
@@ -40,22 +34,6 @@ def median_estimate(times: Sequence[float]) -> Estimate:
     middle = float(np.median(times))
     deviation = 1.4826 * float(np.median(np.abs(np.asarray(times) - middle)))
     return Estimate(middle, 1.2533 * deviation / math.sqrt(len(times)), len(times))
-
-
-def processor_share() -> float:
-    """Share of the processors that this process gets while all its threads compute, in (0, 1]; other work
-    takes the rest."""
-    block = bytes(_PROBE_BYTES)
-
-    def share(_: int) -> float:
-        begin, own = time.perf_counter(), time.thread_time()
-        while time.perf_counter() - begin < _PROBE_SECONDS:
-            hashlib.sha256(block)
-        return (time.thread_time() - own) / (time.perf_counter() - begin)
-
-    threads = worker_threads() or available_cores()
-    with ThreadPoolExecutor(threads) as pool:
-        return min(1.0, statistics.fmean(pool.map(share, range(threads))))
 
 
 def is_long(seconds: float, size: float) -> bool:

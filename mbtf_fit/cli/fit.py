@@ -159,9 +159,9 @@ def _announce(
 ) -> None:
     """State budget and expected time of a fit, and refuse one that the disk cannot hold."""
     from mbtf_core.files.folders import check_space
-    from mbtf_core.forecast import is_long, processor_share
+    from mbtf_core.forecast import is_long
     from mbtf_fit.native import missing_reason
-    from mbtf_fit.training.forecast import closing_seconds, fit_bytes, preparing_seconds
+    from mbtf_fit.training.forecast import fit_bytes, seconds_besides_training
     from mbtf_fit.training.suitable_data import open_data
 
     data = [open_data(folder, config.model) for folder in shards]
@@ -170,7 +170,7 @@ def _announce(
     training = config.training
     budget = training.time if training.steps is None else f"{training.steps} steps"
     queries = sum(int(one.manifest["splits"]["train"].get("queries", 0)) for one in data)
-    beside = (preparing_seconds(queries) + closing_seconds(queries)) / processor_share()
+    beside = seconds_besides_training(queries)
     console.note(
         f"{what}, training for {budget} (change it with --time or --steps); reading, calibration and errors "
         f"take about {beside:.0f} s beside it"

@@ -9,19 +9,11 @@ from mbtf_fit.config import FitConfig
 from mbtf_fit.models.registry import material_of
 from mbtf_fit.surface.known import surface_bytes
 
-# Seconds of a fit before its training and after it, and those of each query of its data: of the default model
-# at 64 and 128 texels, on two cores.
-_BEFORE, _AFTER = (3.0, 0.6e-6), (5.0, 0.1e-6)
 
-
-def preparing_seconds(queries: float) -> float:
-    """Expected seconds of a fit before training, for so many queries of data: start, reading, hints."""
-    return _BEFORE[0] + _BEFORE[1] * queries
-
-
-def closing_seconds(queries: float) -> float:
-    """Expected seconds of a fit after training: energy calibration, errors, distillation, writing."""
-    return _AFTER[0] + _AFTER[1] * queries
+def seconds_besides_training(queries: float) -> float:
+    """Expected seconds of a fit of so many queries for reading, hints, energy calibration, errors,
+    distillation and writing: of the default model at 64 and 128 texels, on two free cores."""
+    return 8.0 + 0.7e-6 * queries
 
 
 def fit_bytes(config: FitConfig, lattice: Lattice) -> int:
