@@ -42,11 +42,11 @@ HINTS = {
     "KHR_texture_basisu": "export it with PNG or JPEG textures in place of KTX2",
     "EXT_texture_webp": "export it with PNG or JPEG textures in place of WebP",
     "EXT_texture_avif": "export it with PNG or JPEG textures in place of AVIF",
+    "EXT_mesh_gpu_instancing": "export the instances as nodes",
     "MSFT_texture_dds": "export it with PNG or JPEG textures in place of DDS",
 }
 # Those that are read.
 READ = {
-    "EXT_mesh_gpu_instancing",
     "KHR_materials_clearcoat",
     "KHR_materials_ior",
     "KHR_materials_sheen",
