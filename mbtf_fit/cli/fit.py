@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -48,7 +48,6 @@ def fit(
     options: FitOptions = FitOptions(),  # noqa: B008
     many: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
     shared_decoder: Annotated[Switch, Parameter(group=MORE)] = False,
-    tensorboard: Annotated[Path | None, Parameter(metavar="FOLDER", group=MORE)] = None,
     cluster: ClusterOption = None,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
@@ -70,12 +69,9 @@ def fit(
         that fails does not stop the others.
     shared_decoder
         With --many, fit all data sets together with one network. --time is that of all of them.
-    tensorboard
-        Write the curves of the fit as event files for TensorBoard to a folder.
     """
     for refused, what, hint in (
         (many is not None and shards is not None, "--many replaces the argument SHARDS", "leave out one"),
-        (many is not None and bool(tensorboard), "--tensorboard shows one fit", "leave out one of them"),
         (many is None and shared_decoder, "--shared-decoder requires --many", "mbtf-fit --many a/ b/ ..."),
         (many is None and cluster is not None, "--cluster requires --many", "mbtf-fit --many a/ b/ ..."),
     ):
@@ -99,14 +95,13 @@ def fit(
 
     folder = DataFolder.open(shards)
     config = resolve_config(options, quality, folder)
-    _fit_one(config, folder, output, tensorboard, overwrite, verbose, console)
+    _fit_one(config, folder, output, overwrite, verbose, console)
 
 
 def _fit_one(
     config: FitConfig,
     shards: DataFolder,
     output: Path,
-    tensorboard: Path | None,
     overwrite: bool,
     verbose: bool,
     console: Console,
@@ -115,22 +110,17 @@ def _fit_one(
     from mbtf_fit.material.format import DESCRIPTION_NAME
     from mbtf_fit.training.endings import describe_ending, describe_kept
     from mbtf_fit.training.fit import fit
-    from mbtf_fit.training.fit_folder import EventLog
 
     finished = not overwrite and (output / DESCRIPTION_NAME).exists()
     if not finished:
         _announce(config, [shards], output, f"{shards} -> {output}: {config.model}", console)
-    with (
-        nullcontext() if tensorboard is None else EventLog(tensorboard) as log,
-        console.progress(total=100, label="reading", unit="%") as bar,
-    ):
+    with console.progress(total=100, label="reading", unit="%") as bar:
         result = fit(
             config,
             shards,
             output,
             overwrite=overwrite,
             progress=_training_progress(bar, output),
-            observe=log,
         )
     if finished:
         console.note(f"{output}: this fit is already finished; --overwrite trains it again")
