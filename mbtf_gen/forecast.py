@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mbtf_core.data.shard_files import write_shard
-from mbtf_core.forecast import pilot_seconds
-from mbtf_core.stats import pooled_error
+from mbtf_core.stats import Estimate, pooled_error
 from mbtf_core.units import clock, rate_text, size_text
 from mbtf_gen.job import (
     Job,
@@ -33,6 +34,8 @@ _HALVES = ("value_a", "value_b")
 _PIECE_PATHS, _FIRST_PATHS, _PIECE_SECONDS = 1 << 19, 1 << 13, 0.5
 # Relative error of a predicted noise from which it is stated; a pilot without highlights has a tenth of it.
 _UNCERTAIN = 0.02
+# Fewest timed pieces of a pilot.
+_FEWEST_PIECES = 3
 
 
 @dataclass(frozen=True)
@@ -145,3 +148,23 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
         relative_error=error.value,
         relative_error_se=error.error,
     )
+
+
+def pilot_seconds(piece: Callable[[int], float], seconds: float) -> Estimate:
+    """Seconds of one unit of work: the median over timed pieces of it, for so many seconds and three at
+    least. ``piece(number)``, from 1, does a piece and returns how many units of work it was."""
+    times: list[float] = []
+    began = time.perf_counter()
+    while len(times) < _FEWEST_PIECES or time.perf_counter() - began < seconds:
+        start = time.perf_counter()
+        units = piece(len(times) + 1)
+        times.append(max(time.perf_counter() - start, 1e-9) / units)
+    return median_estimate(times)
+
+
+def median_estimate(times: Sequence[float]) -> Estimate:
+    """Median of timings in seconds, which other work on the machine changes little. Its standard error
+    follows from the median absolute deviation, as for a normal distribution."""
+    middle = float(np.median(times))
+    deviation = 1.4826 * float(np.median(np.abs(np.asarray(times) - middle)))
+    return Estimate(middle, 1.2533 * deviation / math.sqrt(len(times)), len(times))

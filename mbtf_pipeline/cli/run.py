@@ -140,7 +140,7 @@ def _report_collection(done: CollectionResult, folder: Path, console: Console) -
 
 def _report(result: RunResult, console: Console, quality: Quality | None) -> None:
     from mbtf_fit import Material
-    from mbtf_fit.cli.advice import suggest
+    from mbtf_fit.cli.evaluate import suggest
     from mbtf_fit.formatting import outliers, unreliable
     from mbtf_fit.training.endings import describe_ending
     from mbtf_fit.training.fit_folder import read_history
