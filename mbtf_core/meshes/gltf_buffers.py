@@ -18,9 +18,8 @@ from mbtf_core.config.settings import build
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import parse_json
 from mbtf_core.meshes.companions import Companions
-from mbtf_core.meshes.content import F64, MOST_TRIANGLES
+from mbtf_core.meshes.content import F64, MOST_TRIANGLES, read_bytes
 from mbtf_core.meshes.gltf_schema import GltfAccessor, GltfDocument
-from mbtf_core.meshes.numbers import read_bytes
 
 Bytes = NDArray[np.uint8]
 T = TypeVar("T")
