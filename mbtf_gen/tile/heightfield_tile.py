@@ -22,7 +22,6 @@ from mbtf_gen.tile.heights import (
     rms_slope,
     slope_angles,
 )
-from mbtf_gen.tile.inspection import ALBEDO_RANGE, oddities
 from mbtf_gen.tile.maps.checks import Codes, far_off, suggestion_warning
 from mbtf_gen.tile.maps.file_names import Convention
 from mbtf_gen.tile.maps.map_loader import Color, MapFacts
@@ -41,6 +40,8 @@ _NORMALIZED = 1.05
 _CLIFFS, _CUSTOMARY = 80.0, 0.05
 # Default limit of the mesh cells across the tile.
 DEFAULT_MESH = 512
+# Luminance from charcoal to fresh snow; outside, a color map is probably not albedo.
+_ALBEDO_RANGE = (0.02, 0.95)
 # Order of the maps in descriptions and in what makes them tileable.
 MAPS = ("height", *ROLES)
 
@@ -237,7 +238,7 @@ class HeightFieldTile(Tile):
         }
 
     def inspect(self, options: GeometrySection, finest: int | None = None) -> dict[str, Any]:
-        """Statistics of the heights and of each map; ``oddities`` lists unusual properties in words."""
+        """Statistics of the heights and of each map."""
         return self.at(options.height_scale, options.mesh)._statistics(finest, options.max_displacement)
 
     def _statistics(self, finest: int | None, max_displacement: float) -> dict[str, Any]:
@@ -249,7 +250,7 @@ class HeightFieldTile(Tile):
         constants = {role: value for role, value in self.maps.items() if np.ndim(value) < 2}
         if self.bsdf is not None:
             del constants["base_color"]
-        found: dict[str, Any] = {
+        return {
             "aspect": self.aspect,
             "make_tileable": self.tiling,
             "resolution": self.lattice(finest).shape()[1],
@@ -280,14 +281,13 @@ class HeightFieldTile(Tile):
             "scale_warning": self.scale_warning(),
             "notes": list(self.notes),
         }
-        return {**found, "oddities": oddities(found)}
 
     def _albedo(self) -> dict[str, Any] | None:
         if self.bsdf is not None:
             return None
         color = np.asarray(self.base_color, np.float64)
         luminance = color @ np.asarray(LUMINANCE)
-        low, high = ALBEDO_RANGE
+        low, high = _ALBEDO_RANGE
         return {
             "min": float(luminance.min()),
             "median": float(np.median(luminance)),
