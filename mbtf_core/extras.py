@@ -23,7 +23,6 @@ EXTRAS = {
     "s3fs": ("stores", "s3fs"),
     "slangpy": ("shaders", "slangpy"),
     "stlpips_pytorch": ("perceptual", "stlpips-pytorch"),
-    "tensorboard": ("tensorboard", "tensorboard"),
 }
 
 

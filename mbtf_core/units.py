@@ -80,12 +80,6 @@ def rate_text(paths_per_second: float) -> str:
     return f"{paths_per_second / 1e3:.{1 if paths_per_second < 1e4 else 0}f} k paths/s"
 
 
-def expectation(seconds: float | None, size: float) -> str:
-    """What a command expects to take, in one line; unknown seconds are left out."""
-    time = "" if seconds is None else f"about {clock(seconds)}, "
-    return f"expected: {time}{size_text(size)} on disk"
-
-
 # Fields of configurations.
 Duration = Annotated[
     float, BeforeValidator(parse_duration), PlainSerializer(format_duration, when_used="json")

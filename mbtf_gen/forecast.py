@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from mbtf_core.data.shard_files import write_shard
-from mbtf_core.forecast import pilot_seconds
-from mbtf_core.stats import pooled_error
+from mbtf_core.stats import Estimate, pooled_error
 from mbtf_core.units import clock, rate_text, size_text
 from mbtf_gen.job import (
     Job,
@@ -33,6 +34,8 @@ _HALVES = ("value_a", "value_b")
 _PIECE_PATHS, _FIRST_PATHS, _PIECE_SECONDS = 1 << 19, 1 << 13, 0.5
 # Relative error of a predicted noise from which it is stated; a pilot without highlights has a tenth of it.
 _UNCERTAIN = 0.02
+# Fewest timed pieces of a pilot.
+_FEWEST_PIECES = 3
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,6 @@ class Forecast:
     seconds, seconds_se : of sampling, tracing and writing all queries with compiled kernels, and the standard
         error
     start : seconds of loading, compiling and the pilot's first piece
-    query_seconds : seconds per training query
     paths : of all splits, including the queries' own pilots under a target error
     paths_per_query : mean over the training split, without pilots
     bytes : of all shards
@@ -55,7 +57,6 @@ class Forecast:
     seconds: float
     seconds_se: float
     start: float
-    query_seconds: float
     paths: int
     paths_per_query: float
     bytes: int
@@ -141,10 +142,29 @@ def forecast(job: Job, plan: RunPlan | None = None, seconds: float = 2.0) -> For
         seconds=total.value,
         seconds_se=total.error,
         start=start,
-        query_seconds=path.value * per_query,
         paths=paths,
         paths_per_query=lights * sum(map(stored, found)) / len(a),
         bytes=data_bytes(job, job.shards),
         relative_error=error.value,
         relative_error_se=error.error,
     )
+
+
+def pilot_seconds(piece: Callable[[int], float], seconds: float) -> Estimate:
+    """Seconds of one unit of work: the median over timed pieces of it, for so many seconds and three at
+    least. ``piece(number)``, from 1, does a piece and returns how many units of work it was."""
+    times: list[float] = []
+    began = time.perf_counter()
+    while len(times) < _FEWEST_PIECES or time.perf_counter() - began < seconds:
+        start = time.perf_counter()
+        units = piece(len(times) + 1)
+        times.append(max(time.perf_counter() - start, 1e-9) / units)
+    return median_estimate(times)
+
+
+def median_estimate(times: Sequence[float]) -> Estimate:
+    """Median of timings in seconds, which other work on the machine changes little. Its standard error
+    follows from the median absolute deviation, as for a normal distribution."""
+    middle = float(np.median(times))
+    deviation = 1.4826 * float(np.median(np.abs(np.asarray(times) - middle)))
+    return Estimate(middle, 1.2533 * deviation / math.sqrt(len(times)), len(times))

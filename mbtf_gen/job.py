@@ -241,23 +241,12 @@ def split_queries(job: Job, split: Split) -> int:
 
 def planned_paths(job: Job, entries: Iterable[ShardEntry]) -> int:
     """Paths of some shards; a target error may change them."""
-    return round(sum(_paths(job, entry) for entry in entries))
 
+    def paths(entry: ShardEntry) -> float:
+        config, split = job.config, entry.split
+        return entry.rows * row_queries(job, split) * split_spp(config, split) / split_lights(config, split)
 
-def query_work(job: Job) -> float:
-    """Number of paths of one light that take as long as a training query."""
-    lights = split_lights(job.config, "train")
-    return split_spp(job.config, "train") / lights * path_work(lights)
-
-
-def planned_work(job: Job, entries: Iterable[ShardEntry]) -> float:
-    """Number of paths of one light that take as long as the paths of some shards."""
-    return sum(path_work(split_lights(job.config, entry.split)) * _paths(job, entry) for entry in entries)
-
-
-def _paths(job: Job, entry: ShardEntry) -> float:
-    config, split = job.config, entry.split
-    return entry.rows * row_queries(job, split) * split_spp(config, split) / split_lights(config, split)
+    return round(sum(map(paths, entries)))
 
 
 def most_paths(job: Job) -> int:

@@ -13,7 +13,7 @@ from mbtf_core.app.console import Console
 from mbtf_core.config.settings import build
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.files.atomic import file_sha256, read_json
-from mbtf_core.files.folders import owned
+from mbtf_core.files.folders import check_space, owned
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item
 from mbtf_core.units import clock
@@ -153,8 +153,8 @@ class _RecipeRun:
         from mbtf_core.data.documents import read_manifest
         from mbtf_core.data.folder import sidecar_name
         from mbtf_core.data.schema import MANIFEST_NAME
-        from mbtf_gen.generation.run import generate
-        from mbtf_gen.job import Job
+        from mbtf_gen.generation.run import generate, unfinished
+        from mbtf_gen.job import Job, data_bytes
 
         job = Job.load(data.config)
         if data.stage == GENERATE_STAGE:  # that of another layout is of the same material
@@ -171,6 +171,8 @@ class _RecipeRun:
             or read_manifest(shards)["config_hash"] != job.config_hash
         ):
             clear(shards)
+        hint = "reduce generate.queries with --set or --quality, or choose another folder with -o"
+        check_space(shards, data_bytes(job, unfinished(job, shards)), hint)
         with self.console.progress(None, data.stage, "paths") as bar:
             done = generate(job, shards, progress=bar.update, runner=self.runner)
         # Workers render at the same time; slices of earlier processes are the time that the data took.

@@ -25,8 +25,7 @@ from typing import Annotated, Any
 from cyclopts import App, CycloptsError, Group, Parameter, UnusedCliTokensError
 from pydantic_core import to_jsonable_python
 
-from mbtf_core.app.help import HELP_ALL, MORE, show_whole_page
-from mbtf_core.app.options import Switch
+from mbtf_core.app.options import HELP_ALL, MORE, Switch, show_whole_page
 from mbtf_core.app.progress import BarProgress, LineProgress, Progress
 from mbtf_core.errors import (
     EXIT_BAD_INPUT,

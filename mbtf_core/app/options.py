@@ -15,6 +15,7 @@ values that were given::
         config = options.resolve(material=material)
 
 ``--config FILE`` and ``--set a.b=c`` come with them. Options that several commands share are declared here.
+``--help`` describes what most people need and names the rest; ``--help-all`` describes all.
 """
 
 from __future__ import annotations
@@ -27,14 +28,37 @@ from dataclasses import dataclass, make_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, Literal, TypeVar, Union
 
-from cyclopts import Parameter, Token
+from cyclopts import Group, Parameter, Token
+from cyclopts.help import DefaultFormatter, HelpPanel
 from pydantic import BaseModel, TypeAdapter
 from pydantic.fields import FieldInfo
 
-from mbtf_core.app.help import MORE
 from mbtf_core.config.settings import Settings, explicit_options, parts_of, resolve
 from mbtf_core.errors import UsageError
 from mbtf_core.paths import split_url
+
+HELP_ALL = "--help-all"
+# Whether the running command line asks for the whole page.
+_whole = False
+
+
+def show_whole_page(whole: bool) -> None:
+    """Choose what the next help page describes: all options, or those that most people need."""
+    global _whole
+    _whole = whole
+
+
+def _format_more(console: Any, options: Any, panel: HelpPanel) -> None:
+    """Options of the group MORE: a panel on the whole page, their names on the short one."""
+    if _whole:
+        DefaultFormatter()(console, options, panel)
+    elif panel.entries:
+        names = ", ".join(entry.names[0] for entry in panel.entries)
+        console.print(f"{HELP_ALL} describes more options: {names}", markup=False, highlight=False)
+
+
+# Options that few people need; shown last.
+MORE = Group("More options", sort_key=1, help_formatter=_format_more)
 
 S = TypeVar("S", bound=Settings)
 C = TypeVar("C", bound="Options[Any]")

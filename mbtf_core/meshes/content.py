@@ -1,7 +1,8 @@
-"""What a file of triangles holds: shapes, what they reflect, and the files that it refers to."""
+"""What a file of triangles holds: numbers, shapes, what they reflect, and the files that it refers to."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
+from mbtf_core.paths import opened
 
 F64 = NDArray[np.float64]
 Wrap = Literal["repeat", "mirror", "clamp"]
@@ -148,3 +150,30 @@ def with_colors(shape: MeshShape, path: Path, warnings: list[str]) -> MeshShape:
     if base is not None and np.any(base != 1.0):
         warnings.append(f"'{shape.name}': its color multiplies the colors of its vertices")
     return replace(shape, values={"base_color": np.ones(3), **shape.values})
+
+
+def parse(text: bytes, kind: type) -> NDArray[Any] | None:
+    """Numbers, np.float64 or np.int64, between blanks and line breaks; None where one word is none."""
+    if not text.strip():
+        return np.zeros(0, kind)
+    with warnings.catch_warnings():
+        # Older versions of NumPy warn of words that are no numbers.
+        warnings.simplefilter("error")
+        try:
+            return np.fromstring(text, kind, sep=" ")
+        except (ValueError, DeprecationWarning):
+            return None
+
+
+def words_per_line(text: bytes) -> NDArray[np.int64]:
+    """Number of words of each line."""
+    return np.array([len(line.split()) for line in text.splitlines()], np.int64)
+
+
+def read_bytes(path: Path) -> bytes:
+    """Content of a file; an InputError where it cannot be read, or is empty."""
+    with opened(path) as stream:
+        data = stream.read()
+    if not data:
+        raise InputError("is empty", where=path)
+    return data

@@ -6,7 +6,6 @@ material are one shape.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import InputError
-from mbtf_core.meshes.content import F64, MOST_TRIANGLES, MeshContent, MeshShape, of_faces
+from mbtf_core.meshes.content import F64, MOST_TRIANGLES, MeshContent, MeshShape
 from mbtf_core.meshes.gltf_buffers import FLOAT, HINTS, READ, GltfFile
 from mbtf_core.meshes.gltf_material import Materials
-from mbtf_core.meshes.gltf_schema import GltfInstancing, GltfMaterial, GltfMesh, GltfNode, GltfPrimitive
+from mbtf_core.meshes.gltf_schema import GltfMaterial, GltfMesh, GltfNode, GltfPrimitive
 
 Faces = NDArray[np.int64]
 
@@ -27,8 +26,6 @@ _CUT = "colors of vertices outside of [0, 1] are clamped"
 _AT_REST = {"translation": (0.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0), "scale": (1.0, 1.0, 1.0)}
 # Largest deviation of a quaternion's length from one; quantized ones deviate by one hundredth.
 _UNIT = 0.05
-# Largest deviation of texture coordinates that follow from others.
-_SAME_UV = 1e-5
 
 
 @dataclass
@@ -37,23 +34,18 @@ class _Piece:
 
     vertices: F64
     faces: Faces
-    uv: dict[int, F64]
+    uv: F64 | None
     colors: F64 | None
     normals: F64 | None
 
 
 @dataclass
 class _Group:
-    """Primitives of one material that have the same texture coordinates.
-
-    Attributes
-    ----------
-    places : dict of int to (3, 3) array; texture coordinates (u, v, 1) of each set from those of the first
-    """
+    """Primitives of one material that have the same set of texture coordinates, by its number."""
 
     name: str
     material: GltfMaterial
-    places: dict[int, F64]
+    uv_set: int | None
     pieces: list[_Piece] = field(default_factory=list)
 
 
@@ -72,8 +64,10 @@ def read_gltf(path: Path) -> MeshContent:
                 others = True
                 continue
             material = materials.of(primitive.material)
+            sets = materials.uv_sets(primitive.material)
+            uv_set = next((n for n in sets if f"TEXCOORD_{n}" in primitive.attributes), None)
             try:
-                piece = _piece(file, primitive, material, materials.uv_sets(primitive.material))
+                piece = _piece(file, primitive, material, uv_set)
             except InputError as error:
                 what = f"'meshes.{number}.primitives.{position}': {error.what}"
                 raise InputError(what, where=error.where, hint=error.hint) from None
@@ -82,12 +76,9 @@ def read_gltf(path: Path) -> MeshContent:
                 raise InputError(f"has {total:,} triangles, more than {MOST_TRIANGLES:,}", where=path)
             if not len(piece.faces):
                 continue
-            places = _related(piece.uv, piece.faces)
-            # One matrix for all primitives, unless several sets of coordinates are placed on one.
-            own = (number, position) if len(places) > 1 else None
-            key = (primitive.material, tuple(places), piece.colors is None, piece.normals is None, own)
+            key = (primitive.material, uv_set, piece.colors is None, piece.normals is None)
             name = material.name or mesh.name or "part"
-            group = groups.setdefault(key, _Group(name, material, places))
+            group = groups.setdefault(key, _Group(name, material, uv_set))
             group.pieces.append(_instances(piece, matrices))
     shapes = [_shape(group, materials) for group in groups.values()]
     if others:
@@ -123,23 +114,23 @@ def _placements(file: GltfFile) -> dict[int, F64]:
         if node.mesh is not None:
             mesh = file.entry(document.meshes, node.mesh, "meshes")
             _check_pose(node, mesh, file)
-            own = matrix[None]
-            if node.instancing is not None:
-                own = matrix @ _instance_matrices(file, node.instancing)
-            found.setdefault(node.mesh, []).append(own)
+            found.setdefault(node.mesh, []).append(matrix)
         waiting += [(child, matrix) for child in reversed(node.children)]
     outside = sum(node.mesh is not None for index, node in enumerate(nodes) if index not in seen)
     if outside:
         file.warnings.append(f"{outside} nodes with meshes are not in the scene and not used")
-    return {mesh: np.concatenate(matrices) for mesh, matrices in found.items()}
+    return {mesh: np.stack(matrices) for mesh, matrices in found.items()}
 
 
 def _check_pose(node: GltfNode, mesh: GltfMesh, file: GltfFile) -> None:
-    """Refuse poses that bones and weights define."""
+    """Refuse poses that bones and weights define, and instances beside nodes."""
     name = node.name or mesh.name
     if node.skin is not None:
         hint = "apply the armature and export it again"
         raise InputError(f"'{name}' is posed by a skeleton, which is not read", where=file.path, hint=hint)
+    if node.instancing is not None:
+        what, hint = f"'{name}' has GPU instances, which are not read", "export them as nodes"
+        raise InputError(what, where=file.path, hint=hint)
     if any(node.weights or mesh.weights):
         hint = "apply the shape keys and export it again"
         raise InputError(f"'{name}' is a blend of morph targets, not read", where=file.path, hint=hint)
@@ -164,27 +155,6 @@ def _locals(file: GltfFile) -> F64:
     return out
 
 
-def _instance_matrices(file: GltfFile, instancing: GltfInstancing) -> F64:
-    """Matrices (k, 4, 4) of instances."""
-    given, unused = {}, []
-    for name, index in sorted(instancing.attributes.items()):
-        default = _AT_REST.get(name.lower())
-        if default is None:
-            unused.append(name)
-        else:
-            given[name.lower()] = file.vectors(index, (len(default),), name)
-    if unused:
-        file.warnings.append(f"{', '.join(unused)} of instances are not used")
-    counts = {len(values) for values in given.values()}
-    if len(counts) != 1:
-        raise InputError("has instances of attributes of no or of different lengths", where=file.path)
-    count = counts.pop()
-    translation, rotation, scale = (
-        given.get(name, np.tile(default, (count, 1))) for name, default in _AT_REST.items()
-    )
-    return _transforms(translation, rotation, scale, file)
-
-
 def _transforms(translation: F64, rotation: F64, scale: F64, file: GltfFile) -> F64:
     """Matrices (k, 4, 4) from translations (k, 3), quaternions (k, 4) and scales (k, 3)."""
     from scipy.spatial.transform import Rotation
@@ -200,10 +170,11 @@ def _transforms(translation: F64, rotation: F64, scale: F64, file: GltfFile) -> 
     return out
 
 
-def _piece(file: GltfFile, primitive: GltfPrimitive, material: GltfMaterial, sets: list[int]) -> _Piece:
+def _piece(file: GltfFile, primitive: GltfPrimitive, material: GltfMaterial, uv_set: int | None) -> _Piece:
     """A primitive as its file stores it."""
     vertices, faces = _triangles(file, primitive)
-    uv = _texture_coordinates(file, primitive, sets, len(vertices))
+    uv = _attribute(file, primitive, f"TEXCOORD_{uv_set}", (2,), len(vertices))
+    uv = None if uv is None else uv * (1, -1) + (0, 1)  # v up
     colors = _colors(file, primitive, material, len(vertices))
     return _Piece(vertices, faces, uv, colors, _attribute(file, primitive, "NORMAL", (3,), len(vertices)))
 
@@ -247,14 +218,6 @@ def _attribute(
     return values
 
 
-def _texture_coordinates(
-    file: GltfFile, primitive: GltfPrimitive, sets: list[int], count: int
-) -> dict[int, F64]:
-    """Texture coordinates (n, 2), v up, of those sets that the primitive has."""
-    found = {number: _attribute(file, primitive, f"TEXCOORD_{number}", (2,), count) for number in sets}
-    return {number: uv * (1, -1) + (0, 1) for number, uv in found.items() if uv is not None}
-
-
 def _colors(file: GltfFile, primitive: GltfPrimitive, material: GltfMaterial, count: int) -> F64 | None:
     """Linear colors (n, 3) of the vertices."""
     colors = _attribute(file, primitive, "COLOR_0", (3, 4), count)
@@ -271,23 +234,6 @@ def _colors(file: GltfFile, primitive: GltfPrimitive, material: GltfMaterial, co
         hint = "bake it into the texture of the base color"
         raise InputError("has vertices with alpha, which is not read", where=file.path, hint=hint)
     return np.clip(colors[:, :3], 0.0, 1.0)
-
-
-def _related(uv: Mapping[int, F64], faces: Faces) -> dict[int, F64]:
-    """Matrices (3, 3) that turn texture coordinates (u, v, 1) of the first set into those of each set; sets
-    that do not follow from the first by a matrix are left out."""
-    out: dict[int, F64] = {}
-    first: F64 | None = None
-    for number, values in uv.items():
-        own = of_faces(values, faces)
-        if first is None:
-            first = np.column_stack([own, np.ones(len(own))])
-            out[number] = np.eye(3)
-        elif np.isfinite(first).all() and np.isfinite(own).all():
-            matrix = np.linalg.lstsq(first, own, rcond=None)[0]
-            if np.abs(first @ matrix - own).max() <= _SAME_UV * max(1.0, float(np.abs(own).max())):
-                out[number] = np.vstack([matrix.T, (0.0, 0.0, 1.0)])
-    return out
 
 
 def _instances(piece: _Piece, matrices: F64) -> _Piece:
@@ -310,7 +256,7 @@ def _instances(piece: _Piece, matrices: F64) -> _Piece:
     return _Piece(
         placed.reshape(-1, 3),
         faces.reshape(-1, 3),
-        {number: np.tile(uv, (copies, 1)) for number, uv in piece.uv.items()},
+        None if piece.uv is None else np.tile(piece.uv, (copies, 1)),
         None if piece.colors is None else np.tile(piece.colors, (copies, 1)),
         normals,
     )
@@ -320,15 +266,15 @@ def _shape(group: _Group, materials: Materials) -> MeshShape:
     """All triangles of a group as one shape."""
     pieces = group.pieces
     starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces[:-1])])
-    values, faults = materials.read(group.material, group.places)
-    first = next(iter(group.places), None)
+    values, faults = materials.read(group.material, group.uv_set)
+    uv = [piece.uv for piece in pieces if piece.uv is not None]
     colors = [piece.colors for piece in pieces if piece.colors is not None]
     normals = [piece.normals for piece in pieces if piece.normals is not None]
     return MeshShape(
         group.name,
         np.concatenate([piece.vertices for piece in pieces]),
         np.concatenate([piece.faces + start for piece, start in zip(pieces, starts, strict=True)]),
-        None if first is None else np.concatenate([piece.uv[first] for piece in pieces]),
+        np.concatenate(uv) if uv else None,
         np.concatenate(colors) if colors else None,
         values,
         faults,

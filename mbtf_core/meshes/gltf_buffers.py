@@ -18,9 +18,8 @@ from mbtf_core.config.settings import build
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import parse_json
 from mbtf_core.meshes.companions import Companions
-from mbtf_core.meshes.content import F64, MOST_TRIANGLES
+from mbtf_core.meshes.content import F64, MOST_TRIANGLES, read_bytes
 from mbtf_core.meshes.gltf_schema import GltfAccessor, GltfDocument
-from mbtf_core.meshes.numbers import read_bytes
 
 Bytes = NDArray[np.uint8]
 T = TypeVar("T")
@@ -42,11 +41,11 @@ HINTS = {
     "KHR_texture_basisu": "export it with PNG or JPEG textures in place of KTX2",
     "EXT_texture_webp": "export it with PNG or JPEG textures in place of WebP",
     "EXT_texture_avif": "export it with PNG or JPEG textures in place of AVIF",
+    "EXT_mesh_gpu_instancing": "export the instances as nodes",
     "MSFT_texture_dds": "export it with PNG or JPEG textures in place of DDS",
 }
 # Those that are read.
 READ = {
-    "EXT_mesh_gpu_instancing",
     "KHR_materials_clearcoat",
     "KHR_materials_ior",
     "KHR_materials_sheen",

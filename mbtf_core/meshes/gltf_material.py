@@ -7,7 +7,7 @@ factor alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -75,18 +75,15 @@ class Materials:
         return self._sets[index]
 
     def read(
-        self, material: GltfMaterial, places: Mapping[int, F64]
+        self, material: GltfMaterial, uv_set: int | None
     ) -> tuple[dict[str, Value], dict[str, InputError]]:
-        """What a material reflects: values by role, and faults by role that cannot be read.
-
-        `places` has matrices (3, 3) that turn texture coordinates (u, v, 1) of the shape, v up, into those of
-        each set; other sets are lacking.
-        """
+        """What a material reflects: values by role, and faults by role that cannot be read, such as textures
+        that need other texture coordinates than those of the shape, of the number `uv_set`."""
         values: dict[str, Value] = {}
         faults: dict[str, InputError] = {}
         for role, source in self._sources(material).items():
             try:
-                values[role] = self._value(source, places, material)
+                values[role] = self._value(source, uv_set, material)
             except InputError as error:
                 faults[role] = error
         if material.specular_glossiness is not None and material.pbrMetallicRoughness is None:
@@ -135,13 +132,13 @@ class Materials:
             }
         return found
 
-    def _value(self, source: _Source, places: Mapping[int, F64], material: GltfMaterial) -> Value:
+    def _value(self, source: _Source, uv_set: int | None, material: GltfMaterial) -> Value:
         if (info := source.placed) is None:
             return source.factor
-        if info.uv_set not in places:
+        if info.uv_set != uv_set:
             raise InputError(
-                f"a part of material '{material.name}' has no TEXCOORD_{info.uv_set} of its own, "
-                "which a texture of it needs",
+                f"a texture of material '{material.name}' needs TEXCOORD_{info.uv_set}, which a part of it "
+                "lacks, or has beside others",
                 where=self.file.path,
                 hint="bake its textures to the first texture coordinates, or unwrap it",
             )
@@ -158,7 +155,7 @@ class Materials:
             self._map(texture.source, source),
             (_WRAPS[sampler.wrapS], _WRAPS[sampler.wrapT]),
             sampler.magFilter == _NEAREST,
-            (_FLIP @ _transform(info) @ _FLIP @ places[info.uv_set])[:2],
+            (_FLIP @ _transform(info) @ _FLIP)[:2],
         )
         return placed, source.factor
 

@@ -201,12 +201,6 @@ class GltfMesh(_Object):
     weights: list[Number] = []
 
 
-class GltfInstancing(_Object):
-    """``EXT_mesh_gpu_instancing``."""
-
-    attributes: dict[str, Index]
-
-
 class GltfNode(_Object):
     """A place in the scene."""
 
@@ -219,7 +213,7 @@ class GltfNode(_Object):
     mesh: Index | None = None
     skin: Index | None = None
     weights: list[Number] = []
-    instancing: GltfInstancing | None = _extension("EXT_mesh_gpu_instancing", None)
+    instancing: Any = _extension("EXT_mesh_gpu_instancing", None)
 
 
 class GltfScene(_Object):

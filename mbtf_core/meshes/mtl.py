@@ -12,8 +12,7 @@ import numpy as np
 
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.companions import Companions
-from mbtf_core.meshes.content import Texture
-from mbtf_core.meshes.numbers import read_bytes
+from mbtf_core.meshes.content import Texture, read_bytes
 
 # Numbers after options of images, at most; all other options take one word.
 _NUMBERS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}

@@ -13,9 +13,17 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.companions import Companions
-from mbtf_core.meshes.content import F64, MeshContent, MeshShape, groups_of, with_colors
+from mbtf_core.meshes.content import (
+    F64,
+    MeshContent,
+    MeshShape,
+    groups_of,
+    parse,
+    read_bytes,
+    with_colors,
+    words_per_line,
+)
 from mbtf_core.meshes.mtl import MtlMaterial, as_text, material_values, read_mtl
-from mbtf_core.meshes.numbers import parse, read_bytes, words_per_line
 from mbtf_core.meshes.polygons import CROSSING, triangulate
 from mbtf_core.paths import suggest_name
 

@@ -13,9 +13,18 @@ from numpy.typing import NDArray
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_core.meshes.companions import Companions
-from mbtf_core.meshes.content import F64, I64, MeshContent, MeshShape, Texture, groups_of, with_colors
+from mbtf_core.meshes.content import (
+    F64,
+    I64,
+    MeshContent,
+    MeshShape,
+    Texture,
+    groups_of,
+    parse,
+    read_bytes,
+    with_colors,
+)
 from mbtf_core.meshes.mtl import as_text
-from mbtf_core.meshes.numbers import parse, read_bytes
 from mbtf_core.meshes.polygons import CROSSING, triangulate
 
 _TYPES = {

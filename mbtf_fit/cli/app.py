@@ -8,9 +8,15 @@ from pathlib import Path
 from mbtf_core.app.console import new_app
 from mbtf_fit.cli.fit import fit
 
+# File and function of each.
 _COMMANDS = {
-    **{name: name for name in ("models", "evaluate", "compare", "preview", "view", "info")},
-    "export": "export_material",
+    "models": ("info", "models"),
+    "evaluate": ("evaluate", "evaluate"),
+    "compare": ("pictures", "compare"),
+    "preview": ("pictures", "preview"),
+    "view": ("export", "view"),
+    "info": ("info", "info"),
+    "export": ("export", "export_material"),
 }
 
 
@@ -29,5 +35,5 @@ app = new_app(
 )
 app.usage = "Usage: mbtf-fit SHARDS [OPTIONS]\n       mbtf-fit COMMAND [OPTIONS]"
 app.default(fit)
-for name, function in _COMMANDS.items():
-    app.command(f"mbtf_fit.cli.{name}:{function}", name=name, help=_description(name, function))
+for name, (module, function) in _COMMANDS.items():
+    app.command(f"mbtf_fit.cli.{module}:{function}", name=name, help=_description(module, function))

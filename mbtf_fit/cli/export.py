@@ -1,7 +1,8 @@
-"""``mbtf-fit export``: a material in forms that other programs read."""
+"""``mbtf-fit export`` and ``mbtf-fit view``: a material in forms that other programs read, browsers too."""
 
 from __future__ import annotations
 
+import sys
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
@@ -10,14 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import Output, Overwrite
+from mbtf_core.app.options import Output, Overwrite, whole_number
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.files.folders import OutputKind
-from mbtf_core.run.signals import keep_on_interruption
+from mbtf_core.run.signals import keep_on_interruption, served_until_interruption
 from mbtf_fit.export import Export, targets
 from mbtf_fit.export.images import MapOptions
 from mbtf_fit.export.slang import ShaderOptions
-from mbtf_fit.export.web import PageOptions
+from mbtf_fit.export.web import PageOptions, make_page
 from mbtf_fit.material.texture_formats import TextureFormat
 
 if TYPE_CHECKING:
@@ -142,3 +143,38 @@ def digest_of(value: Any) -> Any:
     if value.is_dir():
         return [file_sha256(file) for file in sorted(value.glob("*.json"))]
     return file_sha256(value) if value.is_file() else "missing"
+
+
+def view(
+    material: Path,
+    /,
+    *,
+    page: PageOptions = PageOptions(),  # noqa: B008
+    port: Annotated[int, Parameter(converter=whole_number)] = 0,
+    console: Console = CONSOLE,
+) -> None:
+    """Show a material in the browser.
+
+    For example: mbtf-fit view material/
+
+    Turn it under lights with the mouse, zoom, and compare it with other materials or with reference
+    pictures. The page is served on this machine alone until Ctrl-C. For a file, see mbtf-fit export --to
+    web.
+
+    Parameters
+    ----------
+    material
+        Folder made by mbtf-fit.
+    port
+        Port of the page; 0 takes a free one.
+    """
+    from mbtf_fit.viewer.server import PageServer
+
+    html, precision = make_page(material, page)
+    server = PageServer(html, port)
+    console.note(precision)
+    with served_until_interruption():
+        console.report({"url": server.url}, f"{server.url}\nopen it in a browser; Ctrl-C ends")
+        # A script that reads the address waits for it.
+        sys.stdout.flush()
+    server.close()

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.help import MORE
 from mbtf_core.app.options import (
+    MORE,
     ClusterOption,
     Options,
     Output,
@@ -25,13 +25,13 @@ from mbtf_core.app.options import (
 from mbtf_core.app.progress import Progress
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.run.signals import keep_on_interruption
-from mbtf_core.units import expectation
-from mbtf_fit.cli.advice import advise
+from mbtf_fit.cli.evaluate import advise
 from mbtf_fit.config import DEFAULT_MODEL, FitConfig, ModelName, best_model
 from mbtf_fit.formatting import describe_fit, fits_table
 
 if TYPE_CHECKING:
     from mbtf_core.data.folder import DataFolder
+    from mbtf_core.data.lattice import Lattice
 
 
 @options_from(FitConfig)
@@ -48,7 +48,6 @@ def fit(
     options: FitOptions = FitOptions(),  # noqa: B008
     many: Annotated[list[Path] | None, Parameter(consume_multiple=True)] = None,
     shared_decoder: Annotated[Switch, Parameter(group=MORE)] = False,
-    tensorboard: Annotated[Path | None, Parameter(metavar="FOLDER", group=MORE)] = None,
     cluster: ClusterOption = None,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
@@ -70,12 +69,9 @@ def fit(
         that fails does not stop the others.
     shared_decoder
         With --many, fit all data sets together with one network. --time is that of all of them.
-    tensorboard
-        Write the curves of the fit as event files for TensorBoard to a folder.
     """
     for refused, what, hint in (
         (many is not None and shards is not None, "--many replaces the argument SHARDS", "leave out one"),
-        (many is not None and bool(tensorboard), "--tensorboard shows one fit", "leave out one of them"),
         (many is None and shared_decoder, "--shared-decoder requires --many", "mbtf-fit --many a/ b/ ..."),
         (many is None and cluster is not None, "--cluster requires --many", "mbtf-fit --many a/ b/ ..."),
     ):
@@ -99,14 +95,13 @@ def fit(
 
     folder = DataFolder.open(shards)
     config = resolve_config(options, quality, folder)
-    _fit_one(config, folder, output, tensorboard, overwrite, verbose, console)
+    _fit_one(config, folder, output, overwrite, verbose, console)
 
 
 def _fit_one(
     config: FitConfig,
     shards: DataFolder,
     output: Path,
-    tensorboard: Path | None,
     overwrite: bool,
     verbose: bool,
     console: Console,
@@ -115,22 +110,17 @@ def _fit_one(
     from mbtf_fit.material.format import DESCRIPTION_NAME
     from mbtf_fit.training.endings import describe_ending, describe_kept
     from mbtf_fit.training.fit import fit
-    from mbtf_fit.training.fit_folder import EventLog
 
     finished = not overwrite and (output / DESCRIPTION_NAME).exists()
     if not finished:
         _announce(config, [shards], output, f"{shards} -> {output}: {config.model}", console)
-    with (
-        nullcontext() if tensorboard is None else EventLog(tensorboard) as log,
-        console.progress(total=100, label="reading", unit="%") as bar,
-    ):
+    with console.progress(total=100, label="reading", unit="%") as bar:
         result = fit(
             config,
             shards,
             output,
             overwrite=overwrite,
             progress=_training_progress(bar, output),
-            observe=log,
         )
     if finished:
         console.note(f"{output}: this fit is already finished; --overwrite trains it again")
@@ -157,29 +147,40 @@ def _training_progress(bar: Progress, folder: Path) -> Callable[[str, float, str
 def _announce(
     config: FitConfig, shards: Sequence[Path | DataFolder], output: Path, what: str, console: Console
 ) -> None:
-    """State budget and expected time of a fit, and refuse one that the disk cannot hold."""
+    """State the time of a fit, and refuse one that the disk cannot hold."""
     from mbtf_core.files.folders import check_space
-    from mbtf_core.forecast import is_long, processor_share
     from mbtf_fit.native import missing_reason
-    from mbtf_fit.training.forecast import closing_seconds, fit_bytes, preparing_seconds
     from mbtf_fit.training.suitable_data import open_data
 
     data = [open_data(folder, config.model) for folder in shards]
-    size = sum(fit_bytes(config, one.lattice) for one in data)
+    size = sum(_fit_bytes(config, one.lattice) for one in data)
     check_space(output, size, "reduce network.channels, or choose another folder with -o")
     training = config.training
     budget = training.time if training.steps is None else f"{training.steps} steps"
     queries = sum(int(one.manifest["splits"]["train"].get("queries", 0)) for one in data)
-    beside = (preparing_seconds(queries) + closing_seconds(queries)) / processor_share()
+    # Reading, hints, energy calibration, errors, distillation and writing: of the default model at 64 and 128
+    # texels, on two free cores.
+    beside = 8.0 + 0.7e-6 * queries
     console.note(
         f"{what}, training for {budget} (change it with --time or --steps); reading, calibration and errors "
         f"take about {beside:.0f} s beside it"
     )
-    seconds = beside + (training.time.seconds if training.steps is None else 0.0)
-    if is_long(seconds, size):
-        console.note(expectation(seconds, size))
     if missing := missing_reason():
         console.note(f"note: training runs in PyTorch, not in the compiled kernel ({missing})")
+
+
+def _fit_bytes(config: FitConfig, lattice: Lattice) -> int:
+    """Bytes that a fit writes at most: a checkpoint of weights, two moments and the best weights, while it
+    replaces another, and the known surface."""
+    import torch
+
+    from mbtf_fit.models.registry import material_of
+    from mbtf_fit.surface.known import surface_bytes
+
+    with torch.device("meta"):
+        model = material_of(config.model, lattice, config.network)
+    surface = surface_bytes(lattice) if model.tracing is not None else 0
+    return 8 * sum(p.nbytes for p in model.parameters()) + surface
 
 
 def resolve_config(

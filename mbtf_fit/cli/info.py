@@ -1,4 +1,4 @@
-"""``mbtf-fit info``: description of a material or a data set."""
+"""``mbtf-fit info`` and ``mbtf-fit models``: descriptions of materials, data sets and models."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import Verbose
+from mbtf_core.app.options import Switch, Verbose
 from mbtf_core.errors import InputError
 from mbtf_core.paths import suggest_path
 from mbtf_core.units import clock
@@ -115,3 +115,34 @@ def _material_info(path: Path, verbose: bool) -> tuple[dict[str, Any], str]:
         "conformance_deviation": deviation,
         **{k: description[k] for k in ("model", "levels", "tile", "weights", "config", "data", "training")},
     }, "\n".join(lines)
+
+
+def models(*, operations: Switch = False, console: Console = CONSOLE) -> None:
+    """List the models that --model takes, with the layout of their data.
+
+    Parameters
+    ----------
+    operations
+        List instead the operations that a model is made of.
+    """
+    from mbtf_fit import ops
+    from mbtf_fit.formatting import format_table
+    from mbtf_fit.models.registry import MODELS
+
+    if operations:
+        exported = (getattr(ops, name) for name in ops.__all__)
+        kinds = [k for k in exported if isinstance(k, type) and issubclass(k, ops.Operation)]
+        found = [
+            {"name": k.__name__, "call": k.signature(), "description": k.summary().replace("`", "")}
+            for k in kinds
+            if k is not ops.Operation
+        ]
+        lines = "\n".join(f"{one['call']}\n    {one['description']}" for one in found)
+        console.report({"operations": found}, lines)
+        return
+    found = [
+        {"name": name, "layout": model.layout, "description": model.description}
+        for name, model in sorted(MODELS.items())
+    ]
+    rows = [["model", *list(found[0])[1:]], *(list(one.values()) for one in found)]
+    console.report({"models": found}, format_table(rows))

@@ -1,1 +1,1 @@
-"""Training of one fit or of several: schedule, checkpoints, calibration, convergence, forecast."""
+"""Training of one fit or of several: schedule, checkpoints, calibration, convergence."""

@@ -57,8 +57,6 @@ from mbtf_fit.training.validation import (
 _REPORT_SECONDS, _VALIDATED = 2.0, 4
 _CHECKPOINT_SECONDS = 15.0
 
-# Called with the record of a validation, the trainer, and the queries of the validation.
-Observer = Callable[[dict[str, Any], Trainer, ShardQueries], None]
 # Called with a phase, the fraction of it that is done, and one line of text.
 ProgressCallback = Callable[[str, float, str], None]
 
@@ -141,7 +139,6 @@ def fit(
     *,
     overwrite: bool = False,
     progress: ProgressCallback | None = None,
-    observe: Observer | None = None,
 ) -> FitResult:
     """Fit a model to a data set and export it as a material.
 
@@ -160,8 +157,6 @@ def fit(
     progress : callable, optional
         Called with the phase (``reading``, ``preparing``, ``training``, ``calibrating``, ``predicting``,
         ``distilling``, ``writing``), the fraction of it that is done, in [0, 1], and one line of text.
-    observe : callable, optional
-        Called after each validation with its record, the trainer, and the queries of the validation.
 
     Returns
     -------
@@ -188,7 +183,7 @@ def fit(
         )
     out = Path(out)
     _check_folder(config, out)
-    return _fit(config, [shards], [out], overwrite, progress, observe)[0]
+    return _fit(config, [shards], [out], overwrite, progress)[0]
 
 
 def fit_jointly(
@@ -250,7 +245,6 @@ def _fit(
     folders: Sequence[Path],
     overwrite: bool,
     progress: ProgressCallback | None,
-    observe: Observer | None = None,
 ) -> list[FitResult]:
     """Fit materials to data sets; the first folder has the checkpoint."""
     begin = time.perf_counter()
@@ -272,7 +266,7 @@ def _fit(
         # A joint fit that was killed may have exported a part of its materials anew.
         finished = finished and not (shared and checkpoint.exists())
         resumed = finished or _train(
-            config, members, checkpoint, device, progress or (lambda phase, fraction, note: None), observe
+            config, members, checkpoint, device, progress or (lambda phase, fraction, note: None)
         )
         checkpoint.unlink(missing_ok=True)
         total = time.perf_counter() - begin
@@ -285,7 +279,6 @@ def _train(
     checkpoint: Path,
     device: torch.device,
     progress: ProgressCallback,
-    observe: Observer | None,
 ) -> bool:
     """Train and export; whether an earlier run was resumed."""
     keep_freed_memory()
@@ -327,8 +320,6 @@ def _train(
         ):
             records.append(history_record(trainer, subset, predicted, previous))
             append_history(member.folder, records[-1])
-            if observe is not None:
-                observe(records[-1], trainer, subset)
         progress("training", loop.fraction, describe_validations(records))
         return all(reached(config, [record]) for record in records)
 

@@ -1,29 +1,23 @@
-"""The folder of a fit: the claim of one configuration and data set on it, the history of validations, and its
-curves for TensorBoard."""
+"""The folder of a fit: the claim of one configuration and data set on it, and the history of validations."""
 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.errors import InputError
-from mbtf_core.extras import import_extra
 from mbtf_core.files.atomic import data_sha256, write_text
 from mbtf_core.files.folders import OutputFolder, OutputKind
 from mbtf_core.paths import refuse_special, suggest_path
 from mbtf_fit.config import FitConfig
-from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.material.format import DESCRIPTION_NAME, WEIGHTS_NAME, read_description
 from mbtf_fit.material.transmittance import TRANSMITTANCE_NAME
 from mbtf_fit.models import code_of
 from mbtf_fit.models.registry import operations_of
 from mbtf_fit.training.loop import CHECKPOINT_NAME
-from mbtf_fit.training.trainer import Trainer
-from mbtf_fit.training.validation import errors_by_level
 
 HISTORY_NAME = "metrics.jsonl"
 FIT = OutputKind("fit.json", "mbtf-fit", 3, "a fit")
@@ -148,46 +142,3 @@ def read_history(folder: str | Path) -> list[dict[str, Any]]:
             break
         out.append(record)
     return out
-
-
-class EventLog:
-    """Writes each validation of a fit to a folder, for ``tensorboard --logdir``; a context manager, and an
-    :data:`~mbtf_fit.training.fit.Observer`. A resumed fit continues its curves.
-
-    Raises
-    ------
-    EngineError
-        TensorBoard is not installed.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        import_extra("tensorboard", "--tensorboard")
-        self._folder = folder
-        self._writer: Any = None
-
-    def __enter__(self) -> EventLog:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        if self._writer is not None:
-            self._writer.close()
-
-    def __call__(self, record: dict[str, Any], trainer: Trainer, subset: ShardQueries) -> None:
-        """Write a record of :func:`~mbtf_fit.training.validation.read_history`, and the errors by level."""
-        step = record["step"]
-        if self._writer is None:
-            from torch.utils.tensorboard.writer import SummaryWriter
-
-            # A killed run may have written steps after the checkpoint that this one resumes from.
-            self._writer = SummaryWriter(str(self._folder), purge_step=step)
-        scalars = {
-            "loss": record["loss"],
-            "unexplained variance": record["unexplained"],
-            "queries per second": record["queries_per_second"],
-        }
-        levels = errors_by_level(trainer, subset) if len(subset) else {}
-        scalars |= {f"unexplained variance by level/{level}": value for level, value in levels.items()}
-        for name, value in scalars.items():
-            if value is not None and math.isfinite(value):
-                self._writer.add_scalar(name, value, step)
-        self._writer.flush()

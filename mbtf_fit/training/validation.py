@@ -12,11 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.stats import (
-    by_group,
-    level_groups,
-    unexplained_variance,
-)
+from mbtf_core.stats import unexplained_variance
 from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.formatting import above_one
@@ -52,13 +48,6 @@ def validation_subset(positions: int, queries: ShardQueries) -> ShardQueries:
 def finite(number: float | None) -> float | None:
     """A number, or None where it is not finite; JSON and plots have no others."""
     return number if number is not None and math.isfinite(number) else None
-
-
-def errors_by_level(trainer: Trainer, queries: ShardQueries) -> dict[str, float | None]:
-    """Unexplained variance by nearest level; None where it is undefined."""
-    level = level_groups(queries.sigma, trainer.model.lattice.finest)
-    values = trainer.predict(queries), *queries.halves
-    return {str(s): finite(e.value) for s, e in by_group(unexplained_variance, level, *values).items()}
 
 
 def history_record(

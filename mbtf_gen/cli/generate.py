@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.help import MORE
 from mbtf_core.app.options import (
+    MORE,
     ClusterOption,
     DataOutput,
     Options,

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated
-
-from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Options, PathText, QualityOption, options_from
@@ -63,7 +60,6 @@ def plan(
     *,
     quality: QualityOption = None,
     options: GenerateOptions = GenerateOptions(),  # noqa: B008
-    measure: Annotated[bool, Parameter(show_default=False)] = True,
     console: Console = CONSOLE,
 ) -> None:
     """Forecast a run: effects of light, time, size and noise.
@@ -76,21 +72,14 @@ def plan(
     ----------
     material
         Height map, folder of maps, material.yaml, mesh, yarns or fibers.
-    measure
-        Measure the bias of omitting each simulated effect by a pilot run, and forecast the run.
     """
+    from mbtf_gen.forecast import forecast
     from mbtf_gen.job import split_target
-    from mbtf_gen.planning.run_plan import plan_effects, skips_pilots
+    from mbtf_gen.planning.run_plan import allocate, measured, plan_effects, skips_pilots
 
     job = prepare_job(options, material, quality)
     job.announce_briefly()
     found = plan_effects(job, pilots=not skips_pilots(job))
-    if not measure:
-        console.report({**found.to_manifest(), "forecast": None}, found.describe())
-        return
-    from mbtf_gen.forecast import forecast
-    from mbtf_gen.planning.run_plan import allocate, measured
-
     expected = forecast(job, allocate(job, found))
     found = measured(job, found)
     text = f"{found.describe()}\n{expected.describe(split_target(job.config, 'train'))}"

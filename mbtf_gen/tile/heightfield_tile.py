@@ -15,14 +15,13 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_core.images.read import LUMINANCE
 from mbtf_core.images.resample import resample
-from mbtf_gen.config.generator import MAX_SCALE, GeometrySection, NormalMode, Tracer
+from mbtf_gen.config.generator import GeometrySection, NormalMode, Tracer
 from mbtf_gen.tile.heights import (
     HeightGrid,
     residual_slopes,
     rms_slope,
     slope_angles,
 )
-from mbtf_gen.tile.inspection import ALBEDO_RANGE, oddities
 from mbtf_gen.tile.maps.checks import Codes, far_off, suggestion_warning
 from mbtf_gen.tile.maps.file_names import Convention
 from mbtf_gen.tile.maps.map_loader import Color, MapFacts
@@ -41,6 +40,8 @@ _NORMALIZED = 1.05
 _CLIFFS, _CUSTOMARY = 80.0, 0.05
 # Default limit of the mesh cells across the tile.
 DEFAULT_MESH = 512
+# Luminance from charcoal to fresh snow; outside, a color map is probably not albedo.
+_ALBEDO_RANGE = (0.02, 0.95)
 # Order of the maps in descriptions and in what makes them tileable.
 MAPS = ("height", *ROLES)
 
@@ -130,19 +131,19 @@ class HeightFieldTile(Tile):
         """(what, hint) where no height scale is given, and stored heights are no tile widths; else None.
 
         They differ by more than a tile's width; or by more than half of it, with slopes of over 80° at half
-        of the surface and no normal map that agrees; or the file declares the size of its pixels.
+        of the surface and no normal map that agrees; or the file is a GeoTIFF.
         """
         facts = self.facts.get("height")
         if facts is None or self.height_from != "default":
             return None
         extent = facts.high - facts.low
-        if facts.pixel_size is None and (facts.bits is not None or extent <= _STEEP):
+        if not facts.terrain and (facts.bits is not None or extent <= _STEEP):
             return None
         white = 1 if facts.bits is None else 2**facts.bits - 1
         what = f"heights from {facts.low * white:.5g} to {facts.high * white:.5g} need a height scale"
         fit = self.normal_fit if self.normal_fit is not None and self.normal_fit.fits else None
         suggested = f"the normal map suggests --height-scale {fit.scale:.3g}" if fit else ""
-        if facts.pixel_size is None and extent <= _NORMALIZED:
+        if not facts.terrain and extent <= _NORMALIZED:
             agrees = fit is not None and not far_off(self.height_scale, fit.scale)
             steep = 0.0 if agrees else self._median_slope
             what = f"{what}: half of the surface would be steeper than {steep:.1f}°"
@@ -150,16 +151,10 @@ class HeightFieldTile(Tile):
             return (what, f"{hint}; 1 where heights are in tile widths") if steep > _CLIFFS else None
         if suggested:
             return what, suggested
-        scale = white / (facts.columns * (facts.pixel_size or 1.0))
-        if facts.pixel_size is None:
-            return what, (
-                f"give --height-scale {scale:.4g}, 1 / {facts.columns} columns, where pixels are 1 apart in "
-                "the unit of the heights; 1 where that is the tile's width"
-            )
-        if scale > MAX_SCALE:
-            return what, f"save them as floats: as integers they need {scale:.4g}, more than {MAX_SCALE}"
-        apart = f"its pixels are {facts.pixel_size:.6g} apart"
-        return what, f"give --height-scale {scale:.4g}, as {apart}, where heights have the same unit"
+        return what, (
+            f"give --height-scale {white / facts.columns:.4g}, {white} / {facts.columns} columns, where "
+            f"pixels are 1 apart in the unit of the heights; {white} where that is the tile's width"
+        )
 
     @property
     def thickness(self) -> float:
@@ -243,7 +238,7 @@ class HeightFieldTile(Tile):
         }
 
     def inspect(self, options: GeometrySection, finest: int | None = None) -> dict[str, Any]:
-        """Statistics of the heights and of each map; ``oddities`` lists unusual properties in words."""
+        """Statistics of the heights and of each map."""
         return self.at(options.height_scale, options.mesh)._statistics(finest, options.max_displacement)
 
     def _statistics(self, finest: int | None, max_displacement: float) -> dict[str, Any]:
@@ -255,7 +250,7 @@ class HeightFieldTile(Tile):
         constants = {role: value for role, value in self.maps.items() if np.ndim(value) < 2}
         if self.bsdf is not None:
             del constants["base_color"]
-        found: dict[str, Any] = {
+        return {
             "aspect": self.aspect,
             "make_tileable": self.tiling,
             "resolution": self.lattice(finest).shape()[1],
@@ -286,14 +281,13 @@ class HeightFieldTile(Tile):
             "scale_warning": self.scale_warning(),
             "notes": list(self.notes),
         }
-        return {**found, "oddities": oddities(found)}
 
     def _albedo(self) -> dict[str, Any] | None:
         if self.bsdf is not None:
             return None
         color = np.asarray(self.base_color, np.float64)
         luminance = color @ np.asarray(LUMINANCE)
-        low, high = ALBEDO_RANGE
+        low, high = _ALBEDO_RANGE
         return {
             "min": float(luminance.min()),
             "median": float(np.median(luminance)),

@@ -1,4 +1,4 @@
-"""The statistics of a tile, which :meth:`Tile.inspect` collects, as text; unusual properties of heights."""
+"""The statistics of a tile, which :meth:`Tile.inspect` collects, as text."""
 
 from __future__ import annotations
 
@@ -7,42 +7,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-# Luminance from charcoal to fresh snow; outside, a color map is probably not albedo.
-ALBEDO_RANGE = (0.02, 0.95)
-# Fraction of the map's RMS slope below which a mesh is reported.
-_KEPT = 0.9
-# Texels above which few distinct floats indicate quantization.
-_MANY = 4096
 # Width to which long texts are wrapped, and lines of the longest list.
 _WIDTH, _MOST_LINES = 100, 24
 # Sentences among the statistics, and what repeats them.
-_TEXTS = ("material", "notes", "oddities", "warnings", "scale_warning", "unused")
-
-
-def oddities(found: Mapping[str, Any]) -> list[str]:
-    """Unusual properties in words."""
-    out = []
-    file, distinct, geometry = found["maps"]["height"], found["heights"]["distinct"], found["geometry"]
-    if file["bits"] is None and 1 < distinct <= 256 and file["rows"] * file["columns"] > _MANY:
-        out.append(
-            f"heights are floats with only {distinct} distinct values: terraces, if they were once integers"
-        )
-    if Path(file["file"]).suffix.lower() in (".jpg", ".jpeg"):
-        out.append("heights come from a JPG: its compression is part of the surface")
-    if geometry["slope_kept"] < _KEPT:
-        kept, columns = geometry["slope_kept"], geometry["map"][1]
-        out.append(f"the mesh keeps {kept:.0%} of the map's RMS slope; --mesh {columns} keeps all")
-    albedo = found["albedo"] or {"share_above": 0.0, "share_below": 0.0}
-    low, high = ALBEDO_RANGE
-    if albedo["share_above"] > 1e-3:
-        out.append(f"{albedo['share_above']:.1%} of the albedo lies above {high}: brighter than snow")
-    if albedo["share_below"] > 0.5:
-        out.append(f"{albedo['share_below']:.0%} of the albedo lies below {low}: blacker than coal")
-    return out
+_TEXTS = ("material", "notes", "warnings", "scale_warning", "unused")
 
 
 def inspection_text(found: Mapping[str, Any], name: str) -> str:
-    """Statistics of a tile as text: name, value and unit of each, then remarks and warnings."""
+    """Statistics of a tile as text: name, value and unit of each, then notes and warnings."""
     numbers = {key: value for key, value in found.items() if key not in _TEXTS}
     flat = {key: value for key, value in numbers.items() if not _is_nested(value)}
     lines = [f"{name} (lengths in tile widths)"]
@@ -53,7 +25,6 @@ def inspection_text(found: Mapping[str, Any], name: str) -> str:
     warnings = brief_warnings(w for w in found["warnings"] if w != scale)
     for title, texts in (
         ("note", found["notes"]),
-        ("remark", found.get("oddities", ())),
         ("warning", [*warnings, *(brief_warnings([scale]) if scale else ())]),
     ):
         for text in texts:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,6 @@ from mbtf_core.config.settings import FileName, Settings
 from mbtf_core.data.schema import Tiling
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256
-from mbtf_core.images.read import MAX_PIXELS
 from mbtf_core.meshes.content import (
     F64,
     MOST_TRIANGLES,
@@ -147,8 +146,6 @@ def _shape(shape: MeshShape, spec: MeshFile, path: Path) -> MeshShape:
         uv = None if found.uv is None else of_faces(found.uv, found.faces)
         for role, value in values.items():
             _check(shape.name, role, value, uv)
-        if uv is not None and len(uv):
-            values = {role: with_one_wrap(value, uv, shape.name) for role, value in values.items()}
     except InputError as error:
         raise InputError(error.what, where=error.where or path, hint=error.hint) from None
     return replace(found, values=values)
@@ -171,6 +168,9 @@ def _check(name: str, role: str, value: Value, uv: F64 | None) -> None:
     if isinstance(value, tuple):
         if uv is None or not np.isfinite(uv).all() or not np.isfinite(value[0].to_uv).all():
             raise InputError(f"'{name}' has no valid texture coordinates for its {role}")
+        if len({*value[0].wrap}) > 1:
+            what = f"a texture of '{name}' has another wrap mode along u than along v"
+            raise InputError(what, hint="give it one, such as REPEAT")
         # Texels beyond what a triangle shows may be out of range.
         value = value[1]
     numbers = numbers_of(value)
@@ -249,39 +249,3 @@ def _atlas(corners: F64) -> tuple[NDArray[np.float32], F64]:
     center = 2.0 * np.stack([column, row], axis=-1)[:, None] + 0.5 + np.array([[0, 0], [1, 0], [0, 1]])
     uv = center / (2 * columns, 2 * rows) * (1, -1) + (0, 1)
     return pixels, uv.reshape(-1, 2)
-
-
-def with_one_wrap(value: Any, uv: F64, name: str) -> Any:
-    """A value whose texture has the same wrap mode along both axes, as far as texture coordinates (n, 2) of
-    the shape reach. Different modes become a larger image that repeats: mirrored copies, and borders that are
-    continued where it was clamped.
-
-    Raises
-    ------
-    InputError : the image would be too large
-    """
-    if not isinstance(value, tuple) or value[0].wrap[0] == value[0].wrap[1]:
-        return value
-    texture, factor = value
-    pixels, matrix = texture.pixels, texture.to_uv.copy()
-    reached = uv @ matrix[:, :2].T + matrix[:, 2]
-    # Columns lie along u, rows against v.
-    for axis, mode in enumerate(texture.wrap):
-        if mode == "repeat":
-            continue
-        along, size = 1 - axis, pixels.shape[1 - axis]
-        low, high = reached[:, axis].min(), reached[:, axis].max()
-        before, after = (int(np.ceil(max(0.0, beyond) * size)) + 1 for beyond in (-low, high - 1.0))
-        if mode == "mirror":
-            before, after = 0, size
-        if (size + before + after) * pixels.shape[axis] > MAX_PIXELS:
-            raise InputError(
-                f"a texture of '{name}' repeats along one axis and is clamped far along the other",
-                hint="scale its texture coordinates, or use one wrap mode",
-            )
-        ends = [(0, 0)] * pixels.ndim
-        ends[along] = (before, after) if axis == 0 else (after, before)
-        pixels = np.pad(pixels, ends, "symmetric" if mode == "mirror" else "edge")
-        matrix[axis] *= size / (size + before + after)
-        matrix[axis, 2] += before / (size + before + after)
-    return replace(texture, pixels=pixels, wrap=("repeat", "repeat"), to_uv=matrix), factor

@@ -42,7 +42,7 @@ def cost(
     from mbtf_core.units import asked_duration, clock
     from mbtf_fit.config import DEFAULT_MODEL
     from mbtf_pipeline.collection.recipes import load
-    from mbtf_pipeline.cost.measurement import other_work, pareto_front
+    from mbtf_pipeline.cost.measurement import pareto_front
     from mbtf_pipeline.cost.page import write_page
     from mbtf_pipeline.cost.study import run_study
     from mbtf_pipeline.recipe import Recipe
@@ -71,13 +71,12 @@ def cost(
         )
     with owned(folder):
         page = write_page(study)
-    front, busy = pareto_front(study.measurements), other_work(study.measurements)
+    front = pareto_front(study.measurements)
     data = {
         "page": page,
         "measurements": len(study.measurements),
         "skipped": study.skipped,
         "failed": study.failed,
-        "busy": busy or None,
         "seconds": study.description["taken"],
         "front": [
             {"seconds": m.seconds.value, "unexplained": m.error.as_dict(), "command": m.command}
@@ -92,6 +91,5 @@ def cost(
         lines[-1] += f"; not measured for lack of time: {len(study.skipped)}"
     lines += [f"failed: {text}" for text in study.failed]
     lines += [study.more] if study.more else []
-    lines += [f"warning: {busy}"] if busy else []
     lines += [f"{clock(m.seconds.value)}: unexplained variance {m.error}: {m.command}" for m in front]
     console.report(data, "\n".join(lines))

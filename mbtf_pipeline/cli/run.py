@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from mbtf_pipeline.collection.run import CollectionResult
     from mbtf_pipeline.run import RunResult
 
+UP_TO_DATE = "up to date"
+
 
 def run(
     recipe: Path,
@@ -47,7 +49,7 @@ def run(
     For example: mbtf-pipeline run pipelines/quickstart.yaml
 
     A stage whose inputs have not changed is skipped; the same command again resumes an interrupted run.
-    --dry-run forecasts the time.
+    --dry-run lists the stages that would run.
 
     Parameters
     ----------
@@ -90,22 +92,17 @@ def run(
     else:
         _refuse(flags, ("quick",), "a recipe of one material", "use --quality draft")
         folder = output or loaded.folder
-        from mbtf_pipeline.forecast import RunForecaster, forecast_left
         from mbtf_pipeline.recipe import preset_recipe
+        from mbtf_pipeline.run import run_recipe, survey
+        from mbtf_pipeline.stages import RUN
 
         loaded = preset_recipe(recipe, quality, own)
-        if not dry_run and (expected := forecast_left(loaded, folder)) is not None:
-            console.note(expected)
         if dry_run:
-            forecaster = RunForecaster(loaded)
-            forecaster.job.announce_briefly()
-            forecast = forecaster.of(loaded)
-            numbers = {"seconds": forecast.seconds, "bytes": forecast.bytes}
-            console.report(numbers, forecast.describe())
+            RUN.check(folder)
+            stages = {name: reason or UP_TO_DATE for name, reason in survey(loaded, folder).items()}
+            console.report({"stages": stages}, "\n".join(f"{name}: {why}" for name, why in stages.items()))
             return
         keep_on_interruption(f"the finished stages are kept in {folder}")
-        from mbtf_pipeline.run import run_recipe
-
         with open_runner(cluster, console.note) as runner:
             result = run_recipe(
                 loaded,
@@ -143,7 +140,7 @@ def _report_collection(done: CollectionResult, folder: Path, console: Console) -
 
 def _report(result: RunResult, console: Console, quality: Quality | None) -> None:
     from mbtf_fit import Material
-    from mbtf_fit.cli.advice import suggest
+    from mbtf_fit.cli.evaluate import suggest
     from mbtf_fit.formatting import outliers, unreliable
     from mbtf_fit.training.endings import describe_ending
     from mbtf_fit.training.fit_folder import read_history
@@ -184,7 +181,7 @@ def _report(result: RunResult, console: Console, quality: Quality | None) -> Non
         "quality": quality,
         "seconds": round(sum(ran.values()), 3),
         "stages": {
-            name: {"ran": name in ran, "reason": stage.reason or "up to date", "seconds": stage.seconds}
+            name: {"ran": name in ran, "reason": stage.reason or UP_TO_DATE, "seconds": stage.seconds}
             for name, stage in result.stages.items()
         },
         "test": fits,

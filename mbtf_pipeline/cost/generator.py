@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from mbtf_core.config.settings import deep_merge, nested
 from mbtf_core.data.schema import Queries
 from mbtf_core.errors import InputError
-from mbtf_core.forecast import median_estimate
 from mbtf_core.stats import Estimate, mean_estimate, signal_variance
 from mbtf_gen.config.generator import GeneratorConfig
+from mbtf_gen.forecast import median_estimate
 from mbtf_gen.job import Job, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.run_plan import allocate, plan_effects

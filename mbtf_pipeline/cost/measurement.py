@@ -14,14 +14,13 @@ from typing import Any
 
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, read_json, write_json
-from mbtf_core.forecast import processor_share
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_pipeline.tables import estimate
 
 # Raised when the method of measuring changes: older measurements are then repeated.
-SCHEMA = 11
+SCHEMA = 12
 # In the folder of a study: measurements, the generator's configuration, and temporary data and fits.
 FOLDER, CONFIG_NAME, WORK = "measurements", "generate.yaml", ".work"
 # About as many configurations of the generator share its time.
@@ -30,8 +29,6 @@ ESTIMATES = ("seconds", "error", "bias", "noise")
 # Relative standard deviation of a run over seeds before any run is repeated, and the degrees of freedom that
 # it counts for: studies of four materials found 1.5 to 6% (docs/results/cost.md).
 PRIOR, PRIOR_DEGREES = 0.05, 4
-# Share of the processors below which other work is worth a warning.
-_FREE = 0.8
 
 
 @dataclass(frozen=True)
@@ -108,7 +105,7 @@ class Measurement:
     study, series, name : of the configuration
     command : reproduces it with the programs
     seconds : its time: per million queries for the generator; of generating, training and everything
-        around them for a run. Its error includes what other work on the machine may have added
+        around them for a run.
     error : relative RMS error of the generator's values, or unexplained variance of a fit
     bias, noise : the two parts of the generator's error; error² = bias² + noise²
     details : further numbers by name: generation and training seconds, bytes, milliseconds
@@ -123,30 +120,6 @@ class Measurement:
     bias: Estimate | None = None
     noise: Estimate | None = None
     details: dict[str, float] = field(default_factory=dict)
-
-
-def measure(configuration: Configuration, conditions: Conditions) -> Measurement:
-    """Measure a configuration.
-
-    With a share s of the processors, a time t would be between s t and t on a machine without other work.
-    """
-    before = processor_share()
-    found = configuration.measure(conditions)
-    share = statistics.fmean((before, processor_share()))
-    error = math.hypot(found.seconds.error, (1.0 - share) * found.seconds.value)
-    details = {**found.details, "processor_share": share}
-    return replace(found, seconds=replace(found.seconds, error=error), details=details)
-
-
-def other_work(found: Iterable[Measurement]) -> str:
-    """That the machine had other work, in one sentence; empty where it had hardly any."""
-    share = statistics.median([m.details.get("processor_share", 1.0) for m in found] or [1.0])
-    if share >= _FREE:
-        return ""
-    return (
-        f"other work left {100 * share:.0f}% of the processors to this study: its times are up to "
-        f"{1 / share:.1f} times too long; repeat it in another folder on a machine without other work"
-    )
 
 
 class MeasurementFolder:
@@ -191,17 +164,14 @@ def seed_deviation(groups: Iterable[Sequence[Measurement]]) -> Estimate:
 
 def combined(group: Sequence[Measurement], deviation: Estimate) -> Measurement:
     """The runs of one configuration as one measurement: name and command of the first one, means of
-    all. The errors by the test set and by other work on the machine are common to all runs, and do not become
-    less by repeats."""
+    all. The error by the test set is common to all runs, and does not become less by repeats."""
     error = statistics.fmean(m.error.value for m in group)
     spread = deviation.value * error / math.sqrt(len(group))
     test = statistics.fmean(m.error.error for m in group)
     details = {k: statistics.fmean(m.details[k] for m in group) for k in group[0].details}
-    mean = mean_estimate([m.seconds.value for m in group])
-    busy = statistics.fmean(m.seconds.error for m in group)
     return replace(
         group[0],
-        seconds=replace(mean, error=math.hypot(mean.error, busy)),
+        seconds=mean_estimate([m.seconds.value for m in group]),
         error=Estimate(error, math.hypot(spread, test), group[0].error.n),
         details={
             **details,

@@ -11,7 +11,7 @@ from typing import Any
 
 from mbtf_core.files.editable import write_document
 from mbtf_core.units import clock
-from mbtf_pipeline.cost.measurement import Measurement, other_work, pareto_front
+from mbtf_pipeline.cost.measurement import Measurement, pareto_front
 from mbtf_pipeline.cost.study import Study
 from mbtf_pipeline.report.plots import Series, plot
 from mbtf_pipeline.report.report import render
@@ -47,7 +47,7 @@ _SIZES = [
     _detail("MB", "bytes", factor=1e-6, digits=".2f"),
     _detail("seeds", "seeds", digits="g"),
 ]
-_REST = [_detail("", name) for name in ("overhead_seconds", "evaluating_seconds", "processor_share")]
+_REST = [_detail("", name) for name in ("overhead_seconds", "evaluating_seconds")]
 _TITLE = Column("configuration", "", lambda m: ", ".join(filter(None, (m.series, m.name))))
 _GENERATOR = [_TITLE, _SECONDS, *_PARTS, _COMMAND]
 _RUNS = [*_SPENT[:1], _field("unexplained variance", "error"), *_SPENT[1:], *_SIZES, _COMMAND]
@@ -99,8 +99,7 @@ def _front_section(runs: Sequence[Measurement], png: Path) -> dict[str, Any]:
         figure = {"svg": "", "caption": "One complete run was measured; a plot and a Pareto front take two."}
         return {"figure": figure, "table": table}
     axes = "seconds in total, from height map to material", "unexplained variance of test queries"
-    bars = "their time: scatter, and what other work may have added"
-    series = _series("complete runs", runs, style="points", x_error_name=bars)
+    series = _series("complete runs", runs, style="points", x_error_name="their time over seeds")
     stepped = [(m.seconds.value, m.error.value) for m in front] if len(front) > 1 else []
     figure = _figure([series], *axes, png, front=stepped)
     return {"figure": figure, "table": table}
@@ -150,7 +149,6 @@ def write_page(study: Study) -> Path:
         taken=clock(study.description["taken"]),
         sections=sections,
         more=study.more,
-        busy=other_work(study.measurements),
         skipped=study.skipped,
         failed=study.failed,
         deviation=f"{study.deviation.scaled(100.0)}%",

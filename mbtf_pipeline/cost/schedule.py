@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -17,7 +16,6 @@ from mbtf_pipeline.cost.measurement import (
     Configuration,
     Measurement,
     MeasurementFolder,
-    measure,
 )
 from mbtf_pipeline.cost.runs import (
     GENERATOR,
@@ -27,8 +25,8 @@ from mbtf_pipeline.cost.runs import (
     planned_runs,
 )
 
-# Seconds by which a run exceeds generating and training on a machine without other work, until one has been
-# measured: of a short fit of the default model, 5 besides training, and 2 of its evaluation.
+# Seconds by which a run exceeds generating and training until one has been measured: of a short fit of the
+# default model, 5 besides training, and 2 of its evaluation.
 OVERHEAD = 7.0
 # By how much the generator's configurations exceed their share, as kernels are compiled.
 COMPILING = 1.2
@@ -45,7 +43,6 @@ class Measurements:
     note : called when a configuration is taken, with its label and the time that it is expected to take
     failed : why runs failed
     path_seconds, step_seconds : seconds of generating a query over its number of paths; of a training step
-    share : of the processors that other work left when `path_seconds` was measured
     """
 
     conditions: Conditions
@@ -55,7 +52,6 @@ class Measurements:
     failed: dict[str, str] = field(default_factory=dict)
     path_seconds: float = 0.0
     step_seconds: float = 0.0
-    share: float = 1.0
     # Whether a run has made the test set.
     tested: bool = False
     # Seconds of measured runs besides the test set, generating and training.
@@ -64,7 +60,7 @@ class Measurements:
     @property
     def overhead(self) -> float:
         """Seconds that a run takes besides the test set, generating and training, at most."""
-        return max(self._besides, default=OVERHEAD / self.share)
+        return max(self._besides, default=OVERHEAD)
 
     @cached_property
     def configurations(self) -> list[Configuration]:
@@ -76,12 +72,11 @@ class Measurements:
         return [self.found[c.label] for c in self.configurations if c.label in self.found or self.recall(c)]
 
     def recall_rate(self, spp: int) -> bool:
-        """Set `path_seconds` and `share` by what is measured of the generator with about so many paths;
+        """Set `path_seconds` by what is measured of the generator with about so many paths;
         whether any is."""
         found = self.of_generator()
         if found:
             self.path_seconds = path_seconds(found, spp)
-            self.share = statistics.median(m.details.get("processor_share", 1.0) for m in found)
         return bool(found)
 
     def plan_runs(self, seconds: float, spp: int) -> list[Run]:
@@ -117,7 +112,7 @@ class Measurements:
                 left = f", about {clock(self.expected_seconds(configuration))}"
             self.note(label + left)
             try:
-                measured = measure(configuration, self.conditions)
+                measured = configuration.measure(self.conditions)
             except PartialError as error:
                 what = failure(error)["error"]
                 raise PartialError(f"{label} failed: {what}", hint=error.hint or RESUMES) from None

@@ -15,7 +15,7 @@ from mbtf_core.files.atomic import read_json
 from mbtf_core.files.editable import write_document
 from mbtf_core.files.folders import ELSEWHERE, OutputKind, check_space, owned
 from mbtf_core.stats import Estimate
-from mbtf_core.units import expectation, format_duration
+from mbtf_core.units import clock, format_duration, size_text
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
 from mbtf_pipeline.cost.generator import benchmark_of
@@ -151,7 +151,7 @@ def run_study(
             runs = measurements.plan_runs(seconds, spp)
             size = disk_bytes(runs)
             check_space(folder, size, "give a shorter --time, or choose another folder with -o")
-            announce(expectation(seconds, size))
+            announce(f"expected: about {clock(seconds)}, {size_text(size)} on disk")
 
             def fits(run: Run) -> bool:
                 return measurements.fits(run, seconds - spent())

@@ -200,8 +200,7 @@ def material_section(config: GeneratorConfig, inputs: Mapping[str, str]) -> dict
             lines.append(f"{facts['low']:.4g} (black) to {facts['high']:.4g} (white)")
         image = data_uri(_thumbnail(role, np.asarray(value)), "jpeg")
         maps.append({"label": title, "lines": lines, "image": image, "alt": f"{title}: {name}", "file": ""})
-    warnings = [*brief_warnings(found["warnings"]), *found.get("oddities", [])]
-    return {"maps": maps, "warnings": warnings, "inspection": text, "missing": ""}
+    return {"maps": maps, "warnings": brief_warnings(found["warnings"]), "inspection": text, "missing": ""}
 
 
 def _thumbnail(role: str, value: Pixels) -> U8:

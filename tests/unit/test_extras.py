@@ -19,7 +19,6 @@ from mbtf_core.extras import EXTRAS, import_extra
 from mbtf_core.run.cluster import open_runner
 from mbtf_fit.backends.shader.slang import SlangCompiler
 from mbtf_fit.export import gltf, materialx, usd
-from mbtf_fit.training.fit_folder import EventLog
 from mbtf_gen.measured.hdf5 import hdf5_file
 from mbtf_gen.publishing.croissant import croissant_text
 from mbtf_gen.publishing.formats import write_parquet
@@ -59,7 +58,6 @@ USES: list[tuple[str, Callable[[Path], object]]] = [
     ("s3fs", lambda folder: open_store("s3://bucket/data")),
     ("slangpy", lambda folder: SlangCompiler()),
     ("stlpips_pytorch", lambda folder: perceptual_metrics.require()),
-    ("tensorboard", EventLog),
 ]
 
 

@@ -20,12 +20,12 @@ PACKAGES = ("mbtf_core", "mbtf_gen", "mbtf_fit", "mbtf_pipeline")
 # The rooms of each package from the lowest to the highest: folders or single files. A room imports from those
 # before it; a comma joins two that stand side by side. A dot stands for the files that no room names.
 ROOMS = {
-    "mbtf_core": ". config files run app images meshes data stats pictures forecast",
+    "mbtf_core": ". config files run app images meshes data stats pictures",
     "mbtf_gen": "sampling measured engine config tile.tracers tile.heights tile.fibers tile.maps tile render"
     " checks doctor,selftest job planning forecast generation pictures publishing cli .",
     "mbtf_fit": "sections formatting ops data native surface pytorch objective backends.cpu models config"
     " material evaluation training backends.mitsuba backends.shader preview comparison viewer export cli .",
-    "mbtf_pipeline": "recipe compare stages tables report run collection forecast cost cli .",
+    "mbtf_pipeline": "recipe compare stages tables report run collection cost cli .",
 }
 RANK = {
     f"{package}.{name}".removesuffix(".."): rank

@@ -33,7 +33,7 @@ CANDIDATES = ("no-such-value", "1.5.5", "-1e300", "1e300", "nan", "{no: such}")
 MODULES = (
     "mbtf_core.run.workers",
     "mbtf_fit.cli.export",
-    "mbtf_fit.cli.preview",
+    "mbtf_fit.cli.pictures",
     "mbtf_gen.tile.fibers.cloth_file",
     "mbtf_gen.tile.maps.material_file",
     "mbtf_gen.tile.mesh_file",

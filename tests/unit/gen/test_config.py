@@ -12,7 +12,7 @@ from mbtf_core.config.settings import resolve
 from mbtf_core.errors import InputError, UsageError
 from mbtf_gen.config.exchange import PublishConfig
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
-from mbtf_gen.job import Job, most_paths, planned_paths, planned_work, query_work, split_queries
+from mbtf_gen.job import Job, most_paths, planned_paths, split_queries
 from mbtf_gen.tile.loading import load_material
 
 
@@ -177,8 +177,5 @@ def test_lights_of_a_path_share_it_in_whole_groups(heights: Path) -> None:
     assert rows(job, "test") == [("test-00000.npz", 30)]
     assert split_queries(job, "train") == 102
     assert planned_paths(job, job.shards) == most_paths(job) == 34 * 2 + 30 * 4
-    # A vertex has four rays instead of two.
-    assert planned_work(job, job.shards) == 34 * 2 * 2 + 30 * 4
-    assert query_work(job) == pytest.approx(2 * 2 / 3)
     # Groups that do not fit into a shard make larger shards.
     assert [n for _, n in rows(job_of(heights, lights_per_path=64))] == [64, 64]

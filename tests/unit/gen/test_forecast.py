@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mbtf_core import forecast as core
 from mbtf_core.app.console import run
 from mbtf_core.data.schema import Queries
 from mbtf_core.files import folders
@@ -84,7 +83,6 @@ def test_pilots_sample_many_directions_in_every_layout(options: dict[str, Any]) 
 def faked(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
     monkeypatch.setattr(module, "time", clock)
-    monkeypatch.setattr(core, "time", clock)
     monkeypatch.setattr(sample_allocation, "build_estimator", lambda job, plan, tiles: Fake(clock))
     monkeypatch.setattr(module, "build_estimator", lambda job, plan: Fake(clock))
 

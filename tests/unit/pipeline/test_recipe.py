@@ -5,19 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import get_args
 
 import numpy as np
 import pytest
 from support.paths import ROOT
 
-from mbtf_core.app.console import Console
+from mbtf_core.app.console import Console, run
 from mbtf_core.app.options import Quality
 from mbtf_core.config.settings import resolve
 from mbtf_core.errors import InputError
+from mbtf_core.files import folders
 from mbtf_fit.config import FITTER, FitConfig
 from mbtf_fit.sections import TimeBudget
 from mbtf_gen.config.generator import GENERATOR, GeneratorConfig, count_queries
+from mbtf_pipeline.cli.app import app
 from mbtf_pipeline.recipe import (
     COMPARE,
     load_recipe,
@@ -84,6 +87,25 @@ def test_data_are_out_of_date_when_a_map_has_changed(tmp_path: Path) -> None:
     assert not survey(recipe, folder)["generate"]
     np.save(path, np.ones((4, 4), np.float32))
     assert survey(recipe, folder)["generate"] == "input changed: height"
+
+
+def test_a_dry_run_lists_what_would_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert run(app, ["run", str(written(tmp_path, SINGLE)), "-o", str(out), "--dry-run"]) == 0
+    assert "generate: has not run\n" in capsys.readouterr().out
+    assert not out.exists()
+    assert run(app, ["run", str(written(tmp_path, SINGLE)), "-o", str(ROOT / "pipelines"), "--dry-run"]) == 3
+    assert "holds no run" in capsys.readouterr().err
+
+
+def test_data_that_do_not_fit_on_the_disk_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: SimpleNamespace(free=1e3))
+    assert run(app, ["run", str(written(tmp_path, SINGLE)), "-o", str(tmp_path / "out")]) == 3
+    message = capsys.readouterr().err
+    assert "1 kB are free" in message
+    assert "--set" in message.splitlines()[-1]
 
 
 def test_a_fit_is_out_of_date_when_the_file_of_its_model_has_changed(

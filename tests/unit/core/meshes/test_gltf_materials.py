@@ -154,21 +154,12 @@ def test_a_second_set_of_texture_coordinates(tmp_path: Path) -> None:
     assert shape.uv.tolist() == [[1, 1], [0, 1], [0, 0], [1, 0]]
 
 
-def two_sets(second: np.ndarray) -> GltfBuilder:
+def test_other_sets_are_a_fault_of_the_roles_that_need_them(tmp_path: Path) -> None:
     builder = GltfBuilder()
     color, rough = (builder.texture(np.zeros((2, 2, 3), np.uint8)) for _ in range(2))
     base = {"baseColorTexture": {"index": color}, "metallicRoughnessTexture": {"index": rough, "texCoord": 1}}
-    return builder.plate(builder.material(base, name="wood"), TEXCOORD_1=second.astype(np.float32))
-
-
-def test_sets_that_follow_from_each_other_are_one(tmp_path: Path) -> None:
-    shape = shape_of(two_sets(SQUARE_UV * 3 + (0.5, -1)), tmp_path)
-    assert place(texture_of(shape), 0.2, 0.7) == [0.2, 0.7]
-    assert place(texture_of(shape, "roughness"), 0.2, 0.7) == [1.1, 1.1]
-
-
-def test_independent_sets_are_a_fault_of_the_roles_that_need_them(tmp_path: Path) -> None:
-    (shape,) = content_of(two_sets(SQUARE_UV**2 + SQUARE_UV[[1, 1, 0, 3]]), tmp_path).shapes
+    builder.plate(builder.material(base, name="wood"), TEXCOORD_1=SQUARE_UV)
+    (shape,) = content_of(builder, tmp_path).shapes
     assert shape.faults.keys() == {"roughness", "metallic"}
     assert "TEXCOORD_1" in shape.faults["roughness"].what
     assert "wood" in shape.faults["roughness"].what

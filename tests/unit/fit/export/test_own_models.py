@@ -75,8 +75,7 @@ def ripple(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     del _KINDS["ripple"], PYTORCH._functions[Ripple]
 
 
-# Networks alone need no other operation.
-@pytest.mark.parametrize("name", sorted(targets().keys() - DOCUMENTS - {"rtxns"}))
+@pytest.mark.parametrize("name", sorted(targets().keys() - DOCUMENTS))
 def test_an_operation_that_readers_lack_is_refused(
     ripple: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

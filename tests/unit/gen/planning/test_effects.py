@@ -179,7 +179,7 @@ def test_the_printed_plan_is_that_of_the_run(tmp_path: Path) -> None:
     """Which is too small for pilots."""
     np.save(tmp_path / "heights.npy", np.random.default_rng(0).random((16, 16)))
     words = ["mbtf-gen", "plan", str(tmp_path / "heights.npy"), "--height-scale", "0.05"]
-    stated = call([*words, "--queries", "1/texel", "--no-measure", "--json"]).result()
+    stated = call([*words, "--queries", "1/texel", "--json"]).result()
     config = {"material": str(tmp_path / "heights.npy"), "geometry": {"height_scale": 0.05}}
     job = Job.load(GeneratorConfig.model_validate({**config, "queries": {"train": "1/texel"}}))
     run = plan_run(job).effects

@@ -11,15 +11,15 @@ from support.fit_data import constant, write_data
 from support.published import LAYOUTS, small
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_gen.publishing.picture import brdf_image, tile_image, write_picture
+from mbtf_gen.publishing.picture import tile_image, write_picture
 
 
-def test_images_have_v_and_the_light_where_they_belong(tmp_path: Path) -> None:
-    """Red is a sine of u, green one of v; blue is the cosine between light and view, from 0 to 2."""
+def test_the_tile_has_u_and_v_where_they_belong(tmp_path: Path) -> None:
+    """Red is a sine of u, green one of v."""
 
     def value(u, sigma, omega_i, omega_o):  # type: ignore[no-untyped-def]
         red, green = 1.0 + 0.5 * np.sin(2 * np.pi * u.T)
-        return np.stack([red, green, 1.0 + (omega_i * omega_o).sum(axis=-1)], axis=-1)
+        return np.stack([red, green, np.ones_like(red)], axis=-1)
 
     write_data(tmp_path / "data", value, train=60_000, test=10, finest=4)
     arrays = Dataset.open(tmp_path / "data").load("train")
@@ -28,13 +28,6 @@ def test_images_have_v_and_the_light_where_they_belong(tmp_path: Path) -> None:
     wave = np.broadcast_to(1.0 + 0.5 * np.sin(2 * np.pi * at), tile.shape[:2])
     np.testing.assert_allclose(tile[..., 0], wave, atol=0.1)
     np.testing.assert_allclose(tile[..., 1], wave[:, ::-1].T, atol=0.1)
-    brdf = brdf_image(arrays)
-    axis = (np.arange(len(brdf)) + 0.5) / len(brdf) * 2 - 1
-    x, y = axis[None, :], -axis[:, None]
-    known = (np.hypot(x, y) < 0.9) & np.isfinite(brdf[..., 2])
-    height = np.sqrt(np.maximum(0.0, 1 - x**2 - y**2))
-    expected = 1 + np.cos(np.radians(50)) * x + np.sin(np.radians(50)) * height
-    assert np.corrcoef(brdf[..., 2][known], expected[known])[0, 1] > 0.95
 
 
 def test_highlights_that_few_queries_see_are_no_specks(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.meshes.content import MeshShape, Texture, numbers_of
 from mbtf_gen.planning.run_plan import plan_effects, reference_plan
 from mbtf_gen.tile.loading import latest_material, load_material
-from mbtf_gen.tile.mesh_file import with_one_wrap, with_vertex_colors
+from mbtf_gen.tile.mesh_file import with_vertex_colors
 from mbtf_gen.tile.mesh_tile import MeshTile
 from mbtf_gen.tile.reflectance import plugin_dictionary
 
@@ -75,7 +75,7 @@ FOLDED = {
 }
 
 
-def texel(pixels: np.ndarray, u: np.ndarray, v: np.ndarray, wrap: tuple[str, str]) -> np.ndarray:
+def texel(pixels: np.ndarray, u: np.ndarray, v: np.ndarray, mode: str) -> np.ndarray:
     """Bilinear look-up at (u, v), v up: the fold is that of texel numbers."""
     rows, columns = pixels.shape[:2]
     x, y = u * columns - 0.5, (1 - v) * rows - 0.5
@@ -85,38 +85,38 @@ def texel(pixels: np.ndarray, u: np.ndarray, v: np.ndarray, wrap: tuple[str, str
             column, row = np.floor(x) + i, np.floor(y) + j
             weight = (1 - np.abs(x - column)) * (1 - np.abs(y - row))
             number = []
-            for index, size, mode in ((column, columns, wrap[0]), (row, rows, wrap[1])):
+            for index, size in ((column, columns), (row, rows)):
                 folded = FOLDED[mode]((index + 0.5) / size) * size - 0.5
                 number.append(np.clip(np.rint(folded), 0, size - 1).astype(int))
             out += weight[:, None] * pixels[number[1], number[0]]
     return out
 
 
-@pytest.mark.parametrize("u", FOLDED)
-@pytest.mark.parametrize("v", FOLDED)
-def test_wrap_modes(u: Any, v: Any) -> None:
+@pytest.mark.parametrize("mode", FOLDED)
+def test_wrap_modes(mode: Any) -> None:
     rng = np.random.default_rng(0)
     pixels = rng.random((3, 5, 3)).astype(np.float32)
     to_uv = np.array([[0.8, 0.3, 0.1], [-0.2, 1.1, 0.4]])
-    value = (Texture(pixels, (u, v), False, to_uv), np.array([1.0, 0.5, 0.25]))
+    value = (Texture(pixels, (mode, mode), False, to_uv), np.array([1.0, 0.5, 0.25]))
     uv = rng.uniform(-2, 3, (400, 2))
-    found = with_one_wrap(value, uv, "a")
-    assert len(set(found[0].wrap)) == 1
     x, y = (uv @ to_uv[:, :2].T + to_uv[:, 2]).T
-    expected = texel(pixels, x, y, (u, v)) * (1, 0.5, 0.25)
-    assert looked_up(found, uv) == pytest.approx(expected, abs=1e-4)
+    expected = texel(pixels, x, y, mode) * (1, 0.5, 0.25)
+    assert looked_up(value, uv) == pytest.approx(expected, abs=1e-4)
+
+
+def test_two_wrap_modes_of_a_texture_are_refused(tmp_path: Path) -> None:
+    builder = GltfBuilder()
+    texture = {"index": builder.texture(np.zeros((2, 2, 3), np.uint8), {"wrapT": 33071})}
+    builder.plate(builder.material({"baseColorTexture": texture}))
+    with pytest.raises(InputError, match="another wrap mode along u"):
+        tile_of(builder, tmp_path)
+    assert tile_of(builder, tmp_path, "base_color: 0.2\n").parts
 
 
 def test_nearest_texels_are_not_interpolated() -> None:
     texture = Texture(np.array([[[0.0] * 3, [1.0] * 3]], np.float32), ("repeat", "repeat"), nearest=True)
     uv = np.array([[0.01, 0.5], [0.49, 0.5], [0.51, 0.5], [0.99, 0.5]])
     assert looked_up((texture, np.ones(3)), uv)[:, 0].tolist() == [0, 0, 1, 1]
-
-
-def test_a_clamped_texture_that_reaches_too_far_is_refused() -> None:
-    texture = Texture(np.zeros((512, 512, 3), np.float32), ("clamp", "repeat"))
-    with pytest.raises(InputError, match="clamped"):
-        with_one_wrap((texture, np.ones(3)), np.array([[0.0, 0.0], [1000.0, 1.0]]), "a")
 
 
 def plans(tile: MeshTile, mode: str = "auto") -> tuple[set[str], set[str]]:

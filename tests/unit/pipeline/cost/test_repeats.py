@@ -12,13 +12,11 @@ import pytest
 from support.fake_runs import TRUE, FakeRuns, MemoryStore, conditions, run
 
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.cost import measurement as module
 from mbtf_pipeline.cost.measurement import (
     PRIOR,
     PRIOR_DEGREES,
     Measurement,
     combined,
-    measure,
     seed_deviation,
 )
 from mbtf_pipeline.cost.runs import Run
@@ -105,15 +103,3 @@ def test_a_mean_has_the_error_of_its_seeds_and_test_sets() -> None:
         "seeds": 2.0,
         "test_error": pytest.approx(0.01),
     }
-
-
-def test_a_time_has_the_error_of_other_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A quarter of the processors was lost, and repeats do not average that."""
-    fake, shares = FakeRuns(), iter([0.8, 0.7] * 2)
-    monkeypatch.setattr(Run, "measure", lambda run, conditions: fake.measure(run))
-    monkeypatch.setattr(module, "processor_share", lambda: next(shares))
-    group = [measure(run(), conditions()) for _ in range(2)]
-    assert group[0].details["processor_share"] == pytest.approx(0.75)
-    assert combined(group, Estimate(0.1, 0.02, 9)).seconds.error == pytest.approx(
-        0.25 * group[0].seconds.value
-    )
