@@ -9,7 +9,6 @@ time from the start to the first shard.
 
 ``import`` writes a file of random values, imports it, and removes both. Formats:
 
-- neuralbtf: images of 128 × 128 texels under 6561 pairs of light and view (1.3 GB);
 - ubo2014: factors of 400 × 400 texels and 151 × 151 pairs, of 200 components in half precision (220 MB);
 - neumip: a list of as many queries as are imported, 40 bytes each.
 
@@ -31,12 +30,11 @@ import numpy as np
 from common import finish, parser_of, start, timed, watched
 
 from mbtf_gen.measured.hdf5 import CHANNELS, COLOR, LIGHT, PLACE, RADIUS, VIEW
-from mbtf_gen.sampling.query_sampler import direction_pairs, slice_directions
+from mbtf_gen.sampling.query_sampler import slice_directions
 
 GENERATE = {"peak_gib": 2.0, "first_shard_seconds": 10.0}
 IMPORT = {"peak_gib": 4.0}
 SHARD_QUERIES = 65536
-SIDE = 128
 # Texels across, directions, and components of a BTF of the University of Bonn.
 TEXELS, DIRECTIONS, COMPONENTS = 400, 151, 200
 
@@ -68,17 +66,6 @@ def generated(material: Path, resolution: int, queries: int, out: Path) -> tuple
     command += ["--height-scale", "0.1", "--mesh", str(resolution), "--effects", "all", "--spp", "16"]
     command += ["--set", "queries.test=1024", "--set", f"output.shard_queries={SHARD_QUERIES}"]
     return watched(command, out)
-
-
-def write_images(path: Path, values: int) -> None:
-    """A capture of NeuralBTF."""
-    light, view = direction_pairs(slice_directions("spiral", 81, 0.2))
-    random = np.random.default_rng(0)
-    with h5py.File(path, "w") as file:
-        file[LIGHT], file[VIEW] = light[:, :2], view[:, :2]
-        color = file.create_dataset(COLOR, (len(light), SIDE, SIDE, 3), np.float32)
-        for pair in range(len(light)):
-            color[pair] = random.random((SIDE, SIDE, 3), np.float32)
 
 
 def write_factors(path: Path, values: int) -> None:
@@ -120,7 +107,7 @@ def write_queries(path: Path, values: int) -> None:
             stored[COLOR][image] = random.random((512, 512, 3), np.float32)
 
 
-WRITERS = {"neuralbtf": write_images, "ubo2014": write_factors, "neumip": write_queries}
+WRITERS = {"ubo2014": write_factors, "neumip": write_queries}
 
 
 def generate(arguments: argparse.Namespace) -> int:
@@ -160,7 +147,7 @@ def main() -> int:
     parser.add_argument("part", nargs="?", choices=("generate", "import"), default="generate")
     parser.add_argument("--resolution", type=int, default=1024)
     parser.add_argument("--queries", type=int, nargs="+", default=[1 << 17, 1 << 19])
-    parser.add_argument("--format", choices=tuple(WRITERS), default="neuralbtf")
+    parser.add_argument("--format", choices=tuple(WRITERS), default="ubo2014")
     parser.add_argument("--values", type=int, default=100_000_000)
     parser.add_argument("--folder", type=Path, help="for the files of an import; 6 GB")
     arguments = parser.parse_args()

@@ -28,7 +28,7 @@ from mbtf_gen.generation.folder import claim_folder
 from mbtf_gen.generation.manifest import Summary, finish, new_manifest
 from mbtf_gen.generation.shard_record import store_shard
 from mbtf_gen.job import shard_entries
-from mbtf_gen.measured.hdf5 import COLOR, MAGIC, RADIUS, NeumipQueries, NeuralBtf, hdf5_file
+from mbtf_gen.measured.hdf5 import COLOR, MAGIC, NeumipQueries, hdf5_file
 from mbtf_gen.measured.interface import MeasuredBtf
 from mbtf_gen.measured.ubo2003 import SUFFIXES, Ubo2003
 from mbtf_gen.measured.ubo2014 import Ubo2014
@@ -56,9 +56,7 @@ MEASURED_CONVENTIONS = {
 TEST_PAIRS = 0.05
 # Queries of a list that are read at once.
 _BLOCK = 1 << 22
-_KNOWN = (
-    "a .btf file (Bonn, DFMF), a folder or zip of photographs named by angles, or HDF5 of NeuMIP or NeuralBTF"
-)
+_KNOWN = "a .btf file (Bonn, DFMF), a folder or zip of photographs named by angles, or HDF5 of NeuMIP"
 
 
 class Import(ABC):
@@ -339,4 +337,4 @@ def open_measured(path: str | Path) -> MeasuredBtf | NeumipQueries:
         names = set(file)
     if COLOR not in names:
         raise InputError(f"is an HDF5 file without '{COLOR}'", where=path, hint=f"known are {_KNOWN}")
-    return NeumipQueries(path) if RADIUS in names or "ground_valid" in names else NeuralBtf(path)
+    return NeumipQueries(path)

@@ -1,6 +1,6 @@
-"""Data sets of other programs as HDF5: queries of NeuMIP, images of NeuralBTF. Files are untrusted.
+"""Data sets of NeuMIP as HDF5. Files are untrusted.
 
-**NeuMIP** (Kuznetsov et al. 2021, "NeuMIP: multi-resolution neural materials"). The
+NeuMIP (Kuznetsov et al. 2021, "NeuMIP: multi-resolution neural materials"). The
 program straintensor/NeuMIP writes and reads these. They have N images of H x W unrelated queries; the images
 have no meaning of their own. Its numbers are of half precision, ours of single precision:
 
@@ -14,15 +14,6 @@ have no meaning of their own. Its numbers are of half precision, ours of single 
 - ``ground_camera_dir``, ``ground_light`` (N, H, W, 2): x and y of the directions in which the camera looks
   and the light travels, z < 0: the opposites of ours. Another writer calls the latter ``ground_light_dir``.
 - ``ground_valid``: in renderings of scenes only, which are refused: their pixels are no queries.
-
-**NeuralBTF** (mandyxmq/NeuralBTF-release), images of a material under many pairs of light and view:
-
-- ``ground_light``, ``ground_camera_dir`` (N, 2): x and y of unit vectors towards the light and the viewer;
-- ``ground_color`` (N, H, W, 3): radiance, linear RGB.
-
-Its documentation says this much. It does not say whether the values include the cosine of the light (the word
-is radiance), which unit they have, or that row 0 is the side of positive y, which is assumed here. Captures
-with a direction for each pixel, (N, H, W, 2), are another format, which that program refuses as well.
 """
 
 from __future__ import annotations
@@ -39,16 +30,7 @@ from numpy.typing import NDArray
 from mbtf_core.data.shard_files import Arrays
 from mbtf_core.errors import InputError, MbtfError, reason
 from mbtf_core.extras import import_extra
-from mbtf_gen.measured.interface import (
-    COMPLETE,
-    F32,
-    HORIZON,
-    I64,
-    MOST_PAIRS,
-    ImageBtf,
-    check_texels,
-    from_plane,
-)
+from mbtf_gen.measured.interface import COMPLETE, HORIZON, from_plane
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 COLOR, VIEW, LIGHT = "ground_color", "ground_camera_dir", "ground_light"
@@ -190,48 +172,3 @@ class NeumipQueries:
         first, last = start // self._each, -(-stop // self._each)
         rows = floats(found, first, last).reshape(-1, channels)
         return rows[start - first * self._each : stop - first * self._each]
-
-
-class NeuralBtf(ImageBtf):
-    """A capture of NeuralBTF, opened; of an image the rows from the first to the last texel are read."""
-
-    def __init__(self, path: Path) -> None:
-        directions = {}
-        with hdf5_file(path) as file:
-            shape = data_set(file, COLOR, path).shape
-            if len(shape) != 4 or shape[3] != 3:
-                raise InputError(f"has the shape {shape} of '{COLOR}'; (N, H, W, 3) is expected", where=path)
-            check_texels(shape[1], shape[2], path)
-            if shape[0] > MOST_PAIRS:
-                raise InputError(f"claims {shape[0]:,} images", where=path)
-            for name in (LIGHT, VIEW):
-                found = data_set(file, name, path)
-                if found.shape != (shape[0], 2):
-                    near = found.shape == (*shape[:3], 2)
-                    raise InputError(
-                        f"has the shape {found.shape} of '{name}'; {(shape[0], 2)} is expected",
-                        where=path,
-                        hint="captures with a direction for each pixel are not read" if near else "",
-                    )
-                xy = floats(found, 0, shape[0])
-                if not np.isfinite(xy).all() or (xy * xy).sum(axis=-1).max() > 1.0 + 1e-3:
-                    raise InputError(
-                        f"has numbers in '{name}' that are not x and y of unit vectors", where=path
-                    )
-                directions[name] = from_plane(xy)
-        self._shape = shape
-        super().__init__(path, shape[1], shape[2], directions[LIGHT], directions[VIEW])
-
-    @contextmanager
-    def _opened(self) -> Iterator[Any]:
-        with hdf5_file(self.path) as file:
-            color = data_set(file, COLOR, self.path)
-            if color.shape != self._shape:
-                raise InputError("has changed while it was read", where=self.path)
-            yield color
-
-    def _texels(self, file: Any, number: int, row: I64, column: I64) -> F32:
-        first = int(row.min())
-        part = np.asarray(file[number, first : int(row.max()) + 1])[row - first, column]
-        with np.errstate(over="ignore", invalid="ignore"):
-            return part.astype(np.float32)

@@ -8,7 +8,6 @@ before it allocates memory for it.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -70,27 +69,6 @@ class MeasuredBtf(ABC):
     @abstractmethod
     def _values(self, number: I64, texel: I64) -> F32:
         """Values (n, 3) at texels of pairs, which have their number in the file."""
-
-
-class ImageBtf(MeasuredBtf):
-    """A BTF whose images are stored one by one."""
-
-    def _values(self, number: I64, texel: I64) -> F32:
-        out = np.empty((len(number), 3), np.float32)
-        order = np.argsort(number, kind="stable")
-        used, starts = np.unique(number[order], return_index=True)
-        with self._opened() as file:
-            for image, group in zip(used, np.split(order, starts[1:]), strict=True):
-                out[group] = self._texels(file, int(image), *np.divmod(texel[group], self.columns))
-        return out
-
-    def _opened(self) -> AbstractContextManager[Any]:
-        """What :meth:`_texels` reads from."""
-        return nullcontext()
-
-    @abstractmethod
-    def _texels(self, file: Any, number: int, row: I64, column: I64) -> NDArray[Any]:
-        """Values (n, 3) of an image at rows and columns (n,)."""
 
 
 def from_angles(theta: NDArray[np.floating[Any]], phi: NDArray[np.floating[Any]]) -> F32:

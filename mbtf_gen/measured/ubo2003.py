@@ -31,7 +31,7 @@ from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError, reason
 from mbtf_core.images.environment import read_linear
 from mbtf_core.paths import opened, real_path
-from mbtf_gen.measured.interface import COMPLETE, I64, ImageBtf, check_texels, from_angles
+from mbtf_gen.measured.interface import COMPLETE, F32, I64, MeasuredBtf, check_texels, from_angles
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".exr", ".hdr")
 _ANGLES = tuple(
@@ -50,7 +50,7 @@ _LINEAR = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
 Content = Callable[[str], bytes]
 
 
-class Ubo2003(ImageBtf):
+class Ubo2003(MeasuredBtf):
     """Photographs in a folder, which may have sub-folders, or in a zip archive. Nothing is unpacked to
     disk."""
 
@@ -82,6 +82,15 @@ class Ubo2003(ImageBtf):
         with self._opened() as content:
             self.rows, self.columns = self._decoded(content, int(self._number[0])).shape[:2]
 
+    def _values(self, number: I64, texel: I64) -> F32:
+        out = np.empty((len(number), 3), np.float32)
+        order = np.argsort(number, kind="stable")
+        used, starts = np.unique(number[order], return_index=True)
+        with self._opened() as content:
+            for image, group in zip(used, np.split(order, starts[1:]), strict=True):
+                out[group] = self._texels(content, int(image), *np.divmod(texel[group], self.columns))
+        return out
+
     @contextmanager
     def _opened(self) -> Iterator[Content]:
         """A function that returns the content of an image by its name."""
@@ -91,8 +100,9 @@ class Ubo2003(ImageBtf):
             with _archive(self.path) as archive:
                 yield lambda name: _read_member(archive, name, self.path)
 
-    def _texels(self, file: Content, number: int, row: I64, column: I64) -> NDArray[np.float32]:
-        pixels = self._decoded(file, number)
+    def _texels(self, content: Content, number: int, row: I64, column: I64) -> F32:
+        """Values (n, 3) of an image at rows and columns (n,)."""
+        pixels = self._decoded(content, number)
         if pixels.shape[:2] != (self.rows, self.columns):
             raise InputError(
                 f"'{_short(self._names[number])}' has {pixels.shape[1]} x {pixels.shape[0]} texels,"

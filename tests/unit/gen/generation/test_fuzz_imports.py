@@ -37,18 +37,12 @@ def samples(folder: Path) -> dict[str, bytes]:
         "ground_camera_dir": random.uniform(-0.6, 0.6, (*shape, 2)),
         "ground_light": random.uniform(-0.6, 0.6, (*shape, 2)),
     }
-    images = {
-        "ground_light": random.uniform(-0.6, 0.6, (5, 2)),
-        "ground_camera_dir": random.uniform(-0.6, 0.6, (5, 2)),
-        "ground_color": random.random((5, 3, 4, 3)),
-    }
     half = {name: array.astype(np.float16) for name, array in queries.items()}
     photographs = dict(list(files.photographs().items())[:3])
     return {
         "btf": files.btf(9, 2),
         "zip": files.zipped(photographs),
         "neumip": files.write_hdf5(folder / "a", half, base_radius=1 / 32).read_bytes(),
-        "neuralbtf": files.write_hdf5(folder / "a", images).read_bytes(),
     }
 
 
@@ -59,7 +53,7 @@ def imported(content: bytes, folder: Path) -> Dataset:
     return Dataset.open(folder / "shards")
 
 
-@pytest.mark.parametrize("name", ["btf", "zip", "neumip", "neuralbtf"])
+@pytest.mark.parametrize("name", ["btf", "zip", "neumip"])
 def test_sound_files_are_imported(name: str, samples: dict[str, bytes], folder: Path) -> None:
     assert len(imported(samples[name], folder).load("train")["sigma"]) > 20
 

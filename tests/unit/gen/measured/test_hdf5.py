@@ -1,4 +1,4 @@
-"""HDF5 of NeuMIP and NeuralBTF: conventions, and files that are refused."""
+"""HDF5 of NeuMIP: conventions, and files that are refused."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from support import measured_files as files
 from support.measured_files import write_hdf5
 
 from mbtf_core.errors import InputError
-from mbtf_gen.measured.hdf5 import NeumipQueries, NeuralBtf
+from mbtf_gen.measured.hdf5 import NeumipQueries
 
-TEXELS = files.ROWS * files.COLUMNS
 FIELDS = ("u", "sigma", "omega_i", "omega_o", "value")
 
 
@@ -120,42 +118,11 @@ def test_numbers_that_are_not_in_the_file(tmp_path: Path) -> None:
         NeumipQueries(tmp_path / "d.hdf5")
 
 
-def pairs() -> tuple[np.ndarray, np.ndarray]:
-    """Nine lights and views above the horizon, as float32."""
-    light, view = files.unit(files.LIGHTS), files.unit(files.VIEWS[:3])
-    return np.tile(light, (3, 1)).astype(np.float32), np.repeat(view, 3, axis=0).astype(np.float32)
-
-
-def images() -> dict[str, np.ndarray]:
-    """A file of the known function whose third light is at the horizon."""
-    light, view = pairs()
-    color = np.array([files.image(i, o) for i, o in zip(light, view, strict=True)], np.float32)
-    light[2, :2] = [1, 0]
-    return {"ground_light": light[:, :2], "ground_camera_dir": view[:, :2], "ground_color": color}
-
-
-def test_images_of_the_known_function(tmp_path: Path) -> None:
-    btf = NeuralBtf(write_hdf5(tmp_path / "a.hdf5", images()))
-    assert (btf.rows, btf.columns, btf.left_out, btf.cosine) == (files.ROWS, files.COLUMNS, 1, None)
-    assert len(btf.light) == 8
-    order = np.random.default_rng(2).permutation(8 * TEXELS)
-    pair, texel = order // TEXELS, order % TEXELS
-    row, column = np.divmod(texel, files.COLUMNS)
-    light, view = btf.light[pair].astype(np.float64), btf.view[pair].astype(np.float64)
-    np.testing.assert_allclose(btf.values(pair, texel), files.value(row, column, light, view), rtol=1e-5)
-    # A few texels of the last rows of one image.
-    at = (files.ROWS - 2) * files.COLUMNS + np.array([1, 6])
-    np.testing.assert_array_equal(
-        btf.values(np.array([3, 3]), at), images()["ground_color"][4].reshape(-1, 3)[at]
-    )
-
-
 def test_numbers_that_a_file_cannot_have(tmp_path: Path) -> None:
     path = tmp_path / "a.hdf5"
     with h5py.File(path, "w") as file:
         shape = (30, 512, 512, 3)
         color = file.create_dataset("ground_color", shape, np.float32, chunks=shape, compression="gzip")
         color[...] = 0.0
-        file["ground_light"] = file["ground_camera_dir"] = np.zeros((30, 2), np.float32)
     with pytest.raises(InputError, match="claims 94,371,840 bytes"):
-        NeuralBtf(path)
+        NeumipQueries(path)
