@@ -70,9 +70,6 @@ class FitConfig(Settings):
     model: Annotated[ModelName, Flag("--model")] = Field(
         DEFAULT_MODEL, description="model to fit, or FILE.py:CLASS; mbtf-fit models describes them"
     )
-    init_from: Annotated[LocalName | None, Flag("--init-from", "FOLDER", rare=True)] = Field(
-        None, description="folder of a material that initializes textures and offset"
-    )
     decoder: Annotated[LocalName | None, Flag("--decoder", "FOLDER", rare=True)] = Field(
         None,
         description="folder of a material whose network is kept: only textures are trained",
@@ -130,8 +127,8 @@ class FitConfig(Settings):
                 "training.losses: the gradient loss compares neighboring texels, which "
                 f"{self.model} never sees together; use a model of the image layout"
             )
-        if self.decoder and (self.training.shared_decoder or self.init_from):
-            raise ValueError("decoder keeps a network as it is: leave out shared_decoder and init_from")
+        if self.decoder and self.training.shared_decoder:
+            raise ValueError("decoder keeps a network as it is: leave out shared_decoder")
         return self
 
     def fields(self) -> dict[str, Any]:
@@ -166,7 +163,7 @@ def _listed(names: list[str]) -> str:
 
 
 _GENERAL = {
-    **{"decoder": None, "init_from": None},
+    "decoder": None,
     "network": NetworkSection().model_dump(),
     "training": TrainingSection().model_dump(),
 }
@@ -261,9 +258,7 @@ def fitter_options(quality: Quality, fits: Mapping[str, Mapping[str, Any]]) -> d
     ----------
     fits : name → explicit options of files and command line, nested, with the model
     """
-    free = not any(
-        "network" in given or given.get("init_from") or given.get("decoder") for given in fits.values()
-    )
+    free = not any("network" in given or given.get("decoder") for given in fits.values())
     out = {}
     for name, given in fits.items():
         training = given.get("training")

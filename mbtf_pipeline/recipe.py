@@ -56,7 +56,7 @@ Kinds = Annotated[
 # Where a recipe of any kind has paths: its own, those of its layers, and those of their fits.
 _PATH = re.compile(
     r"output|library/\d+|materials/[^/]+|((base|quick|(materials|variants)/[^/]+)/)?(generate/material|(each_fit"
-    r"|fit(/(?!network/)[^/]+)?)/(model|init_from|decoder|training/materials/\d+))"
+    r"|fit(/(?!network/)[^/]+)?)/(model|decoder|training/materials/\d+))"
 )
 # Texels of the finest level that a pixel covers at the target, in the pictures of a comparison.
 PIXEL_TEXELS = (1.0, 4.0)

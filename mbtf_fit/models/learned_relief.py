@@ -124,17 +124,6 @@ class LearnedRelief(Relief):
         geometry = Geometry.of_heights(heights.numpy(), material.lattice.aspect)
         material.know(KnownSurface.of(geometry, material.lattice, self.light_width))
 
-    def init_from(self, source: NeuralMaterial) -> None:
-        """Start from the heights of another material of this model."""
-        import torch
-
-        if source.name != self.name:
-            return
-        found, texels = source.known.heights, self.material.texture("heights").texels
-        with torch.no_grad():
-            texels.copy_(((found + FIRST_DEPTH) / HEIGHT_SCALE).reshape(texels.shape))
-        self._see(found, filtered=True)
-
     def state(self) -> dict[str, Tensor]:
         """Heights (H, W) that rays see, those that normals and horizons were filtered from, and in which part
         of the budget."""

@@ -24,13 +24,13 @@ SPECIAL = (
     *("network.output_channels", "network.output_transform", "network.offset", "network.oversampling"),
     "network.encoding",
     *(f"network.relief.{name}" for name in ("places", "hints", "frame", "gate")),
-    *("init_from", "decoder", "training.shared_decoder", "training.materials", "training.own_material"),
+    *("decoder", "training.shared_decoder", "training.materials", "training.own_material"),
     "training.residual_levels",
 )
 # Those of a network that decodes a pyramid of textures.
 PYRAMID = (
     *("network.channels", "network.width", "network.layers", "network.activation", "network.output_channels"),
-    *("network.output_transform", "network.oversampling", "network.encoding", "init_from"),
+    *("network.output_transform", "network.oversampling", "network.encoding"),
     "training.residual_levels",
 )
 SHARED = ("decoder", "training.shared_decoder")
@@ -106,9 +106,6 @@ class Model:
         """Called once the parameters are initialized: know a surface, build an encoder; returns the
         queries."""
         return given.queries
-
-    def init_from(self, source: NeuralMaterial) -> None:
-        """Called once textures and offset of another material have been copied."""
 
     def precompute(self, queries: Any, memory: float) -> Any:
         """Called before training: the queries, with what is known of them where it fits in so many bytes."""

@@ -41,7 +41,7 @@ class Svbrdf(Model):
         "training": {"texture_learning_rate": 0.05, "losses": [{"kind": "relative"}, {"kind": "squared"}]},
     }
     calibrates = False
-    takes = ("init_from",)
+    takes = ()
 
     @classmethod
     def operations(cls, lattice: Lattice, network: NetworkSection) -> list[Operation]:

@@ -126,9 +126,10 @@ class FitResult:
 
 def _check_folder(config: FitConfig, out: Path) -> None:
     """Refuse a network of another architecture, and to replace what the fit reads."""
-    if config.decoder is not None:
-        Decoder.find(config.decoder).check(config)
-    if real_path(out) in map(real_path, filter(None, (config.decoder, config.init_from))):
+    if config.decoder is None:
+        return
+    Decoder.find(config.decoder).check(config)
+    if real_path(out) == real_path(config.decoder):
         raise InputError("holds what the fit starts from", where=out, hint=ELSEWHERE)
 
 

@@ -47,9 +47,8 @@ def identity_of(config: FitConfig, data: Dataset, group: Sequence[Dataset] = ())
     operations = operations_of(config.model, data.lattice, config.network)
     model = data_sha256([operation.as_json() for operation in operations])
     config_hash += "".join(f"-{digest}" for digest in (model, *code_of(config.model).values()))
-    # One of them at most.
-    for source in filter(None, (config.init_from, config.decoder)):
-        description, _ = read_description(Path(source))
+    if config.decoder is not None:
+        description, _ = read_description(Path(config.decoder))
         config_hash += f"-{description['weights']['sha256']}"
     if group:
         config_hash += f"-{data_sha256([other.manifest['config_hash'] for other in group])}"

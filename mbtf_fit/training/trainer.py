@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -15,7 +14,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.errors import InputError
 from mbtf_fit.backends.cpu.model import supports
 from mbtf_fit.backends.cpu.stepper import Adam, NativeStepper
 from mbtf_fit.config import FitConfig
@@ -25,7 +23,6 @@ from mbtf_fit.data.queries import ShardQueries, TrainingQueries, mean_value
 from mbtf_fit.data.streaming import StreamedQueries
 from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.inference import predict
-from mbtf_fit.material.material import Material
 from mbtf_fit.models.model import Model, Preparation
 from mbtf_fit.models.registry import material_of, model_class
 from mbtf_fit.native import kernel
@@ -45,10 +42,6 @@ BETAS = (0.8, 0.95)
 # Widest blur, in tile widths. A blur of half a tile made training unstable on textures of 16 × 16 texels: the
 # offsets of three of eight fits diverged before the textures became sharp.
 WIDEST_BLUR = 0.125
-# Tensors that ``init_from`` copies, by the first part of their names; the decoder keeps its initialization.
-_SHARED = ("pyramid", "offset_texture", "offset_network")
-# Displacement of `relief`, copied from materials that have it.
-_DEPTH_WEIGHTS = "depth_weights"
 # Difference of fractional levels that rounding explains.
 _SAME_LEVEL = 1e-4
 # Largest share of the budget that the warm-up takes.
@@ -361,8 +354,6 @@ def prepare_trainer(
         training = training.as_queries(data.lattice, config.seed)
     training = training.to(device)
     training = hooks.prepare(Preparation(data, training, config.training, unit, config.seed, load))
-    if config.init_from is not None:
-        _initialize_from(hooks, config.init_from)
     if config.decoder is not None:
         Decoder.find(config.decoder).load(model)
     noise = NoiseModel.silent(unit, data.lattice)
@@ -373,25 +364,3 @@ def prepare_trainer(
     if shared is not None:
         model.share_networks(shared)
     return Trainer(config, model, training, noise, hooks)
-
-
-def _initialize_from(hooks: Model, folder: str | Path) -> None:
-    """Copy textures and offset of a material into a model of like levels, channels, width and offset.
-
-    A step of the hierarchical model takes several times as long as a step of ``neumip``. Both share textures
-    and offset, which ``neumip`` learns sooner.
-    """
-    model, source = hooks.material, Material.load(folder).model
-    given, mine = source.weights(), model.weights()
-    names = [name for name in mine if name.partition(".")[0] in _SHARED]
-    names += [_DEPTH_WEIGHTS] if _DEPTH_WEIGHTS in mine and _DEPTH_WEIGHTS in given else []
-    for name in names:
-        if name not in given or given[name].shape != mine[name].shape:
-            raise InputError(
-                f"its '{name}' does not have the shape that the fit needs",
-                where=folder,
-                hint="fit it with the same levels, network.channels, network.width, network.layers, "
-                "network.offset and network.oversampling",
-            )
-    model.load_weights({**mine, **{name: given[name] for name in names}})
-    hooks.init_from(source)

@@ -48,7 +48,7 @@ def test_mistakes_are_one_line_and_a_hint(
 
 def test_paths_are_taken_where_names_are(tmp_path: Path) -> None:
     assert GeneratorConfig(material=tmp_path).material == str(tmp_path)
-    assert FitConfig(init_from=tmp_path).init_from == str(tmp_path)
+    assert FitConfig(decoder=tmp_path).decoder == str(tmp_path)
 
 
 def test_notebooks_complete_the_public_names() -> None:

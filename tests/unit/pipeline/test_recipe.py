@@ -141,8 +141,8 @@ def test_every_path_is_relative_to_the_recipe(tmp_path: Path, monkeypatch: pytes
         "from mbtf_fit.models.svbrdf import Svbrdf\n\n\nclass Mine(Svbrdf):\n    pass\n"
     )
     fits = (
-        "fit:\n  one: &one {model: mine.py:Mine, init_from: fits/a}\n  two: *one\n  neumip: {<<: *one, "
-        "model: neumip, init_from: 's3://bucket/a'}\n  relief: {decoder: ../b}\n"
+        "fit:\n  one: &one {model: mine.py:Mine}\n  two: *one\n  neumip: {<<: *one, "
+        "model: neumip, decoder: 's3://bucket/a'}\n  relief: {decoder: ../b}\n"
         "  rainer2020: {training: {materials: [c, d]}}\noutput: run\n"
     )
     recipe = load_recipe(written(tmp_path, HEAD + fits))
@@ -154,8 +154,7 @@ def test_every_path_is_relative_to_the_recipe(tmp_path: Path, monkeypatch: pytes
         assert Path(found.generate.material) == tmp_path / "maps" / "height.npy"
         assert found.folder == folder
         assert fit["one"].model == fit["two"].model == f"{tmp_path}/mine.py:Mine"
-        assert fit["one"].init_from == fit["two"].init_from == f"{tmp_path}/fits/a"
-        assert (fit["neumip"].model, fit["neumip"].init_from) == ("neumip", "s3://bucket/a")
+        assert (fit["neumip"].model, fit["neumip"].decoder) == ("neumip", "s3://bucket/a")
         assert fit["relief"].decoder == str(tmp_path.parent / "b")
         assert fit["rainer2020"].training.materials == (f"{tmp_path}/c", f"{tmp_path}/d")
 

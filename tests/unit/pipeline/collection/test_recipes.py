@@ -137,14 +137,15 @@ def test_paths_of_every_layer_are_relative_to_the_recipe(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir("/")
-    text = TEXT.replace("{training: {steps: 500,", "{init_from: base, training: {steps: 500,")
-    text = text.replace("{training: {steps: 3}}", "{init_from: quick}")
-    text = text.replace("height_scale: 0.5}}}", "height_scale: 0.5}}, each_fit: {init_from: own}}")
+    text = TEXT.replace("neumip-baseline", "neumip")
+    text = text.replace("{training: {steps: 500,", "{decoder: base, training: {steps: 500,")
+    text = text.replace("{training: {steps: 3}}", "{decoder: quick}")
+    text = text.replace("height_scale: 0.5}}}", "height_scale: 0.5}}, each_fit: {decoder: own}}")
     path = written(tmp_path, text)
     for quick, name in ((False, "base"), (True, "quick")):
         runs, _ = planned(path, quick)
         for run, layer in (("here", name), ("steep", "own")):
-            assert {fit.init_from for fit in runs[run].fit.values()} == {str(tmp_path / layer)}
+            assert {fit.decoder for fit in runs[run].fit.values()} == {str(tmp_path / layer)}
 
 
 def test_every_variant_is_one_run(tmp_path: Path) -> None:
