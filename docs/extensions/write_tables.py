@@ -9,14 +9,12 @@ Tables stand between a comment that names them and the next one::
     <!-- end -->
     <!-- schema arrays -->
     <!-- end -->
-    <!-- operations lookup shade -->
+    <!-- operations all -->
     <!-- end -->
 """
 
 from __future__ import annotations
 
-import importlib
-import inspect
 import re
 from pathlib import Path
 
@@ -45,27 +43,21 @@ def schema(name: str) -> str:
     return table(("array", "unit", "components, and channels in EXR", "meaning"), rows)
 
 
-def operations(modules: list[str]) -> str:
-    """The operations of some modules of ``mbtf_fit.ops``, with their arguments."""
-    rows = []
-    for name in modules:
-        module = importlib.import_module(f"mbtf_fit.ops.{name}")
-        for found in filter(inspect.isclass, vars(module).values()):
-            if issubclass(found, Operation) and found.__module__ == module.__name__:
-                rows.append(f"- `{found.signature()}`: {cell(found.summary())}")
-    return "\n".join(rows)
+def operations() -> str:
+    """All operations, with their arguments."""
+    return "\n".join(f"- `{k.signature()}`: {cell(k.summary())}" for k in Operation.__subclasses__())
 
 
 def written(page: str) -> str:
     """A page with its tables as they are now."""
 
     def replaced(found: re.Match[str]) -> str:
-        name, *options = words = found[3].split()
+        name, *options = found[3].split()
         if found[2] == "configuration":
             keys = (option.partition("=") for option in options)
             text = configuration(name, **{key: value.split(",") for key, _, value in keys})
         else:
-            text = schema(name) if found[2] == "schema" else operations(words)
+            text = schema(name) if found[2] == "schema" else operations()
         return f"{found[1]}\n{text}\n\n{found[5]}"
 
     return _TABLE.sub(replaced, page)

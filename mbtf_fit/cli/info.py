@@ -125,17 +125,14 @@ def models(*, operations: Switch = False, console: Console = CONSOLE) -> None:
     operations
         List instead the operations that a model is made of.
     """
-    from mbtf_fit import ops
     from mbtf_fit.formatting import format_table
-    from mbtf_fit.models.registry import MODELS
+    from mbtf_fit.models.registry import MODELS, UNUSABLE
+    from mbtf_fit.ops import Operation
 
     if operations:
-        exported = (getattr(ops, name) for name in ops.__all__)
-        kinds = [k for k in exported if isinstance(k, type) and issubclass(k, ops.Operation)]
         found = [
             {"name": k.__name__, "call": k.signature(), "description": k.summary().replace("`", "")}
-            for k in kinds
-            if k is not ops.Operation
+            for k in Operation.__subclasses__()
         ]
         lines = "\n".join(f"{one['call']}\n    {one['description']}" for one in found)
         console.report({"operations": found}, lines)
@@ -145,4 +142,5 @@ def models(*, operations: Switch = False, console: Console = CONSOLE) -> None:
         for name, model in sorted(MODELS.items())
     ]
     rows = [["model", *list(found[0])[1:]], *(list(one.values()) for one in found)]
-    console.report({"models": found}, format_table(rows))
+    faults = [f"{fault.where} {fault.what}" for fault in UNUSABLE.values()]
+    console.report({"models": found, "unusable": faults}, "\n".join([format_table(rows), *faults]))

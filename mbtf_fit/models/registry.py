@@ -28,8 +28,9 @@ if TYPE_CHECKING:
     from mbtf_fit.pytorch.material import NeuralMaterial
 
 
-def _find() -> dict[str, type[Model]]:
-    found: dict[str, type[Model]] = {}
+def _find() -> tuple[dict[str, type[Model]], dict[str, InputError]]:
+    """The models by name, and why those of other packages cannot be used: others stay usable."""
+    found, faults = dict[str, type[Model]](), dict[str, InputError]()
     for entry in pkgutil.iter_modules(mbtf_fit.models.__path__, "mbtf_fit.models."):
         if entry.name == __name__:
             continue
@@ -38,27 +39,24 @@ def _find() -> dict[str, type[Model]]:
             if own and "name" in vars(item):
                 found[item.name] = item
     for name, point in FOREIGN.items():
+        why = "a model of this project has the same name" if name in found else ""
         try:
             model = point.load()
         except Exception as error:  # whatever the code of others raises
-            raise _unusable(name, reason(error)) from error
-        if not (isinstance(model, type) and issubclass(model, Model) and getattr(model, "name", "") == name):
-            raise _unusable(name, f"{point.value} is no model of this name")
-        if name in found:
-            raise _unusable(name, "a model of this project has the same name")
-        found[name] = model
-    return found
+            model, why = None, reason(error)
+        if not why and not (isinstance(model, type) and issubclass(model, Model)):
+            why = f"{point.value} is no model"
+        elif not why and (named := getattr(model, "name", "")) != name:
+            why = f"{point.value} has the name '{named}', which must be that of the entry point"
+        if why:
+            where, hint = f"entry point '{name}' of mbtf.models", "correct or uninstall its package"
+            faults[name] = InputError(f"cannot be used ({why})", where=where, hint=hint)
+        else:
+            found[name] = model
+    return found, faults
 
 
-def _unusable(name: str, why: str) -> InputError:
-    return InputError(
-        f"cannot be used ({why})",
-        where=f"entry point '{name}' of mbtf.models",
-        hint="correct or uninstall its package",
-    )
-
-
-MODELS = _find()
+MODELS, UNUSABLE = _find()
 
 
 def model_class(name: str) -> type[Model]:
@@ -67,8 +65,11 @@ def model_class(name: str) -> type[Model]:
 
     Raises
     ------
-    InputError : the file is missing or raises an exception, or has no such model
+    InputError : the file is missing or raises an exception, or has no such model, or the package of that
+        name cannot be used
     """
+    if name in UNUSABLE:
+        raise UNUSABLE[name]
     if name in MODELS:
         return MODELS[name]
     file, wanted = file_and_class(name) or ("", name)

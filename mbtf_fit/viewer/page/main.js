@@ -20,7 +20,9 @@ function statusLine(viewer, test) {
     progress = `drawing in full resolution: ${Math.floor((100 * row) / height)}%${full < 1 ? "" : ` of ${timeText(full)}`}`;
   const beyond = test?.beyond
     ? `, ${test.beyond} of ${test.count} test queries deviate, by up to ${Number((100 * test.largest).toPrecision(2))}%`
-    : "";
+    : test
+      ? `, all ${test.count} test queries agree`
+      : "";
   return `${tilesText(camera.tiles_across)} across, a pixel is ${texels} texel${texels === 1 ? "" : "s"} wide (level ${level.toFixed(1)} of ${finest}), ${progress}${beyond}`;
 }
 

@@ -137,10 +137,15 @@ def test_another_package_brings_a_model(tmp_path: Path, run_python: RunPython) -
     [
         ("texel-diffuse = my_model:Missing", "has no attribute 'Missing'"),
         ("neumip = my_model:Named", "has the same name"),
+        ("other = my_model:TexelDiffuse", "has the name 'texel-diffuse'"),
     ],
 )
 def test_a_package_at_fault_is_named(tmp_path: Path, run_python: RunPython, point: str, fault: str) -> None:
+    """Where its model is asked for, and in the list; others can be used."""
     path = install(tmp_path, point)
+    listed = run_python("-m", "mbtf_fit", "models", PYTHONPATH=path)
+    assert listed.returncode == 0, listed.stderr
+    assert fault in listed.stdout
     done = run_python("-m", "mbtf_fit", "no-such-shards", "--model", point.split(" ")[0], PYTHONPATH=path)
     assert done.returncode == 3
     assert "Traceback" not in done.stderr
