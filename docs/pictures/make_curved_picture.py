@@ -46,9 +46,9 @@ DIRECTIONS = {
     "spot": ((12.0, 130.0), (40.0, 180.0)),
     "cloth": ((10.0, -105.0), (40.0, -25.0)),
 }
-# Tiles around charts, or per unit of the mesh files: radii of 2 tiles, and of 5.
+# Tiles around charts, or per unit of the mesh files: radii of 2 tiles, and of 4.5.
 TILES = {"sphere": 13, "spot": 16.0, "cloth": 5.0}
-MEASURED = {"sphere": 13, "sphere, radius 5": 31, "cylinder": 13, "torus": 13, "spot": 16.0, "cloth": 5.0}
+MEASURED = {"sphere": 13, "sphere, radius 4.5": 28, "cylinder": 13, "torus": 13, "spot": 16.0, "cloth": 5.0}
 MATERIALS = ("twisted_wool", "cliff_rock", "insulation_foam", "turtle_shell")
 
 

@@ -11,7 +11,7 @@ leave the same error: a ratio of 1.000 ± 0.004 over seven pairs of fits.
 
 Heights have 16 bits in both formats, as view rays are traced to them, and maps 8: highlights depend on their
 slopes and roughness, which in blocks add a tenth to the error of glossy `turtle_shell`. Horizons have 8 bits
-too, as their variance is a difference; ``bc4`` leaves out their finest level, and lookups read the next, which
+too, as their variance is a difference; ``bc4`` leaves out their finest level, and lookups read the next: that
 adds 5 to 12% to the error and saves a third of the bytes.
 Moments of slopes are clamped to all but a hundredth on either side: a few steep texels would leave others
 too few steps, which added 7% to the error of ``twisted_wool`` and now adds 1%. What has been decoded is
