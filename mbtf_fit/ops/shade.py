@@ -122,7 +122,8 @@ class Lobe(Operation):
 
     Attributes
     ----------
-    base_color, specular, alpha2, slopes : b (3), F0 (1 or 3), α² (1) with α = roughness², slopes s (2)
+    base_color, specular, alpha2, slopes : b (3), F0 (1 or 3), α² (1) with α = roughness², slopes s (2);
+        without slopes, ``Transform("flat", "omega_o[0:2]", scale=0.0)``
     omega_i, omega_o : directions (3)
     weight : w (1), which scales all of the lobe's reflectance, or None for 1
     least_alpha2 : bound of α² from below
