@@ -27,10 +27,12 @@ from mbtf_core.images.color_spaces import (
 # Stored gammas of the known spaces (sRGB: 1/2.2), and the tolerance of their comparison.
 _GAMMAS: dict[ColorSpace, float] = {"srgb": 0.45455, "linear": 1.0}
 _SLACK = 0.005
-# Tags of EXIF, TIFF, GDAL and GeoTIFF.
+# Tags of EXIF, TIFF and GeoTIFF.
 _INTEROPERABILITY = 0xA005
 _ORIENTATION, _WHITE, _PRIMARIES, _PROFILE = 274, 318, 319, 34675
-_PIXEL_SCALE, _TRANSFORMATION, _NODATA = 33550, 34264, 42113
+_PIXEL_SCALE, _TIE_POINT, _TRANSFORMATION, _KEYS, _NODATA = 33550, 33922, 34264, 34735, 42113
+# Key of the model type, its value for degrees, and meters of a degree of latitude.
+_MODEL_TYPE, _GEOGRAPHIC, _DEGREE = 1024, 2, 111_320.0
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Tags:
         `space` in spite of its name
     orientation : of EXIF; 1 is upright
     nodata : number that stands for missing data
-    terrain : whether the file is a GeoTIFF, of heights in meters or another unit of length
+    pixel_size : distance of neighboring columns, in meters or the file's own unit
     unused : what else the file holds, as warnings
     """
 
@@ -54,7 +56,7 @@ class Tags:
     foreign: str | None = None
     orientation: int = 1
     nodata: float | None = None
-    terrain: bool = False
+    pixel_size: float | None = None
     unused: tuple[str, ...] = ()
 
 
@@ -102,8 +104,7 @@ def tiff_tags(tags: Any) -> Tags:
     nodata = None
     with contextlib.suppress(ValueError):
         nodata = float(str(tags.valueof(_NODATA)).strip(" \0"))
-    terrain = any(tags.valueof(code) is not None for code in (_PIXEL_SCALE, _TRANSFORMATION))
-    return Tags(*color, _upright(found[_ORIENTATION]), nodata, terrain)
+    return Tags(*color, _upright(found[_ORIENTATION]), nodata, _pixel_size(tags))
 
 
 def exr_tags(header: Mapping[str, Any]) -> Tags:
@@ -182,6 +183,20 @@ def _upright(orientation: Any) -> int:
 def _ratios(numbers: Sequence[int]) -> list[float]:
     """Numbers of numerators and denominators in turn."""
     return [n / d if d else math.nan for n, d in zip(numbers[::2], numbers[1::2], strict=False)]
+
+
+def _pixel_size(tags: Any) -> float | None:
+    """Distance of the columns of a GeoTIFF; of degrees, in meters at the latitude of its first tie point."""
+    scale, matrix, keys = (tags.valueof(code) for code in (_PIXEL_SCALE, _TRANSFORMATION, _KEYS))
+    tie = tags.valueof(_TIE_POINT)
+    try:
+        size = abs(scale[0]) if scale else math.hypot(matrix[0], matrix[4])
+        entries = [tuple(keys[i : i + 4]) for i in range(4, len(keys or ()), 4)]
+        if (_MODEL_TYPE, 0, 1, _GEOGRAPHIC) in entries:
+            size *= _DEGREE * math.cos(math.radians(tie[4] if tie else matrix[7]))
+    except (TypeError, IndexError, ValueError):
+        return None
+    return float(size) if 0 < size < math.inf else None
 
 
 def _cicp_chunk(path: Path) -> bytes | None:

@@ -15,7 +15,7 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
 from mbtf_core.images.read import LUMINANCE
 from mbtf_core.images.resample import resample
-from mbtf_gen.config.generator import GeometrySection, NormalMode, Tracer
+from mbtf_gen.config.generator import MAX_SCALE, GeometrySection, NormalMode, Tracer
 from mbtf_gen.tile.heights import (
     HeightGrid,
     residual_slopes,
@@ -131,19 +131,19 @@ class HeightFieldTile(Tile):
         """(what, hint) where no height scale is given, and stored heights are no tile widths; else None.
 
         They differ by more than a tile's width; or by more than half of it, with slopes of over 80° at half
-        of the surface and no normal map that agrees; or the file is a GeoTIFF.
+        of the surface and no normal map that agrees; or the file declares the size of its pixels.
         """
         facts = self.facts.get("height")
         if facts is None or self.height_from != "default":
             return None
         extent = facts.high - facts.low
-        if not facts.terrain and (facts.bits is not None or extent <= _STEEP):
+        if facts.pixel_size is None and (facts.bits is not None or extent <= _STEEP):
             return None
         white = 1 if facts.bits is None else 2**facts.bits - 1
         what = f"heights from {facts.low * white:.5g} to {facts.high * white:.5g} need a height scale"
         fit = self.normal_fit if self.normal_fit is not None and self.normal_fit.fits else None
         suggested = f"the normal map suggests --height-scale {fit.scale:.3g}" if fit else ""
-        if not facts.terrain and extent <= _NORMALIZED:
+        if facts.pixel_size is None and extent <= _NORMALIZED:
             agrees = fit is not None and not far_off(self.height_scale, fit.scale)
             steep = 0.0 if agrees else self._median_slope
             what = f"{what}: half of the surface would be steeper than {steep:.1f}°"
@@ -151,10 +151,16 @@ class HeightFieldTile(Tile):
             return (what, f"{hint}; 1 where heights are in tile widths") if steep > _CLIFFS else None
         if suggested:
             return what, suggested
-        return what, (
-            f"give --height-scale {white / facts.columns:.4g}, {white} / {facts.columns} columns, where "
-            f"pixels are 1 apart in the unit of the heights; {white} where that is the tile's width"
-        )
+        scale = white / (facts.columns * (facts.pixel_size or 1.0))
+        if facts.pixel_size is None:
+            return what, (
+                f"give --height-scale {scale:.4g}, 1 / {facts.columns} columns, where pixels are 1 apart in "
+                "the unit of the heights; 1 where that is the tile's width"
+            )
+        if scale > MAX_SCALE:
+            return what, f"save them as floats: as integers they need {scale:.4g}, more than {MAX_SCALE}"
+        apart = f"its pixels are {facts.pixel_size:.6g} apart"
+        return what, f"give --height-scale {scale:.4g}, as {apart}, where heights have the same unit"
 
     @property
     def thickness(self) -> float:

@@ -56,7 +56,7 @@ class MapFacts:
     names : their names, where the file has others
     low, high : smallest and largest stored number of these channels, without alpha
     colorspace : ``srgb``, ``linear``, or the name of the color space that was converted
-    terrain : whether the file is a GeoTIFF
+    pixel_size : distance of neighboring columns that the file declares, in meters or its own unit
     inverted : whether 1 - x of them is used
     """
 
@@ -69,7 +69,7 @@ class MapFacts:
     low: float
     high: float
     colorspace: str = "linear"
-    terrain: bool = False
+    pixel_size: float | None = None
     inverted: bool = False
 
 
@@ -106,10 +106,10 @@ class MapLoader:
         count = image.stored.shape[2]
         used = image.stored[..., :-1] if count in (2, 4) else image.stored
         low, high = (float(extreme) / image.white for extreme in (used.min(), used.max()))
-        terrain = image.tags.terrain
+        size = image.tags.pixel_size
         self.files[role] = path
         self.facts[role] = MapFacts(
-            path, *image.shape, image.bits, count, image.channels, low, high, space, terrain
+            path, *image.shape, image.bits, count, image.channels, low, high, space, size
         )
         if entry.channel is not None:
             self.settings[f"{role}.channel"] = entry.channel

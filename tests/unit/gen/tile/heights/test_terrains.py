@@ -1,7 +1,8 @@
-"""Terrains: missing data, heights in meters, GeoTIFF."""
+"""Terrains: missing data, heights in meters, and files that state the size of their pixels."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -75,10 +76,31 @@ def test_heights_in_meters_need_a_scale(tmp_path: Path) -> None:
     assert load_material(tmp_path / "m.yaml").configured(DEFAULT).grid is not None
 
 
-def test_integers_of_a_geotiff_need_a_scale(tmp_path: Path) -> None:
-    path = terrain(tmp_path / "dem.tif", hills().astype("u2"), (33550, 12, (30.0, 30.0, 0.0)))
-    with pytest.raises(InputError, match=r"580 to 620 need a height scale"):
-        _ = load_material(path).configured(DEFAULT).grid
+SCALE, TIE, MATRIX, KEYS = 33550, 33922, 34264, 34735
+DEGREES = (KEYS, 3, (1, 1, 0, 1, 1024, 0, 1, 2))
+
+
+@pytest.mark.parametrize(
+    ("dtype", "tags", "scale"),
+    [
+        ("f4", [(SCALE, 12, (30.0, 30.0, 0.0))], 1 / (48 * 30)),
+        # As codes, the unit is 1/65535.
+        ("u2", [(SCALE, 12, (30.0, 30.0, 0.0))], 65535 / (48 * 30)),
+        ("i2", [(MATRIX, 12, (3.0, 8.0, 0, 0, -4.0, 6.0, *[0.0] * 10))], 1 / (48 * 5)),
+        (
+            "i2",
+            [(SCALE, 12, (1 / 3600, 1 / 3600, 0.0)), (TIE, 12, (0, 0, 0, 7.0, 60.0, 0)), DEGREES],
+            3600 / (48 * 111320 * math.cos(math.radians(60))),
+        ),
+    ],
+)
+def test_the_size_of_pixels_gives_the_scale(tmp_path: Path, dtype: str, tags: Any, scale: float) -> None:
+    material = load_material(terrain(tmp_path / "dem.tif", hills().astype(dtype), *tags))
+    with pytest.raises(InputError, match="need a height scale") as caught:
+        _ = material.configured(DEFAULT).grid
+    suggested = float(caught.value.hint.split("--height-scale ")[1].split(",")[0])
+    # The matrix of pixels turned by 53°, not square, has columns 5 apart.
+    assert suggested == pytest.approx(scale, rel=1e-3)
 
 
 def test_fractions_that_are_cliffs_need_a_scale(tmp_path: Path) -> None:
