@@ -28,8 +28,6 @@ ABOVE_ONE = "above 1: worse than the mean value"
 _DECISIVE, _MANY = 1 / 3, 1000
 # Share of an error from which its outliers are named.
 _OUTLYING = 0.25
-# Predictions of so many times the value are spikes.
-_SPIKE = 100.0
 # Colors that make this share of the variance are missed where so much of them is unexplained.
 _COLORED, _UNLEARNED = 0.02, 0.5
 # Standard errors of a significant difference from zero.
@@ -117,8 +115,6 @@ def outliers(split: Mapping[str, Any]) -> list[str]:
     values = f"{found['predicted']:.2g} predicted for {found['value']:.2g}"
     where = "level {:.1f}, elevations of light {:.0f}° and view {:.0f}°, u ({:.3f}, {:.3f})"
     place = where.format(found["level"], *found["elevations"], *found["u"])
-    if found["predicted"] > _SPIKE * max(found["value"], 0.0):
-        place += "; a lobe is too narrow or a gap in the data too wide: add the loss 'squared'"
     return [f"{count} {min(1.0, found['share']):.0%} of the error: {values}, at {place}"]
 
 

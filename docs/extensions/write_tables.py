@@ -45,7 +45,7 @@ def schema(name: str) -> str:
 
 def operations() -> str:
     """All operations, with their arguments."""
-    return "\n".join(f"- `{k.signature()}`: {cell(k.summary())}" for k in Operation.__subclasses__())
+    return "\n".join(f"- `{k.signature()}`: {cell(k.summary())}" for k in Operation.kinds())
 
 
 def written(page: str) -> str:

@@ -5,7 +5,7 @@ From the repository's root: ``.venv/bin/python docs/pictures/make_curved_picture
 the displaced surface (``mbtf-gen reference --surface``), the material with silhouettes, and without. Printed,
 of the material against the path-traced picture: mean, RMS difference of blocks of 16 x 16 pixels over the
 mean, both of blocks that show the object, its noise included, contrast of pixels that both show, and mean
-distance in pixels of the outlines, and of those of the shadow on a screen behind.
+distance in pixels of the outlines, and of those seen from behind along the light, as the shadow has them.
 
 With ``--table``, four materials on six surfaces are measured instead, in an hour, and no picture is made.
 
@@ -129,7 +129,9 @@ def compared(found: Any, expected: Any, shadows: tuple[Any, Any]) -> str:
 
 def main() -> None:
     """Write the picture, or print the table."""
-    table = sys.argv[1:] == ["--table"]
+    if sys.argv[1:] not in ([], ["--table"]):
+        raise SystemExit(__doc__)
+    table = len(sys.argv) > 1
     materials = {name: fitted(name) for name in (MATERIALS if table else MATERIALS[:1])}
     load_mitsuba()
     import mbtf_fit.backends.mitsuba

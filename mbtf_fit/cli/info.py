@@ -132,7 +132,7 @@ def models(*, operations: Switch = False, console: Console = CONSOLE) -> None:
     if operations:
         found = [
             {"name": k.__name__, "call": k.signature(), "description": k.summary().replace("`", "")}
-            for k in Operation.__subclasses__()
+            for k in Operation.kinds()
         ]
         lines = "\n".join(f"{one['call']}\n    {one['description']}" for one in found)
         console.report({"operations": found}, lines)

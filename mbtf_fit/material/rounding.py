@@ -13,7 +13,6 @@ from torch import Tensor
 from mbtf_core.errors import InputError
 from mbtf_fit.material.material import Material, conformance_values
 from mbtf_fit.material.texture_formats import QUANTIZED, TextureFormat, grouped, round_levels
-from mbtf_fit.ops.constants import HORIZONS
 
 
 @dataclass(frozen=True)
@@ -84,15 +83,13 @@ def round_weights(weights: Mapping[str, Tensor], form: TextureFormat) -> dict[st
 def round_material(material: Material, form: TextureFormat) -> tuple[Material, RoundingError]:
     """The material with its numbers rounded, and the rounding error. Arithmetic stays in single precision;
     the conformance values become those of the rounded material. The transmittance is rounded to half
-    precision. In ``bc4``, horizons lose their finest level.
+    precision.
 
     Raises
     ------
     InputError : a number is beyond half precision
     """
     model, weights = material.model.empty_copy(), material.model.weights()
-    if form == "bc4" and model.lattice.finest > 0:
-        weights.pop(f"{HORIZONS}.{model.lattice.finest}", None)
     model.load_weights(round_weights(weights, form))
     transmittance = material.transmittance
     if transmittance is not None and form != "float32":

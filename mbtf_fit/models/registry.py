@@ -39,18 +39,23 @@ def _find() -> tuple[dict[str, type[Model]], dict[str, InputError]]:
             if own and "name" in vars(item):
                 found[item.name] = item
     for name, point in FOREIGN.items():
-        why = "a model of this project has the same name" if name in found else ""
+        why, model, cause = "", None, None
         try:
             model = point.load()
-        except Exception as error:  # whatever the code of others raises
-            model, why = None, reason(error)
+        except (Exception, SystemExit) as error:  # whatever the code of others raises
+            why, cause = reason(error), error
         if not why and not (isinstance(model, type) and issubclass(model, Model)):
             why = f"{point.value} is no model"
         elif not why and (named := getattr(model, "name", "")) != name:
             why = f"{point.value} has the name '{named}', which must be that of the entry point"
+        elif not why and name in found:
+            why = "a model of this project has the same name"
+        elif not why and not hasattr(model, "description"):
+            why = f"{point.value} has no description"
         if why:
             where, hint = f"entry point '{name}' of mbtf.models", "correct or uninstall its package"
             faults[name] = InputError(f"cannot be used ({why})", where=where, hint=hint)
+            faults[name].__cause__ = cause
         else:
             found[name] = model
     return found, faults
@@ -68,10 +73,10 @@ def model_class(name: str) -> type[Model]:
     InputError : the file is missing or raises an exception, or has no such model, or the package of that
         name cannot be used
     """
-    if name in UNUSABLE:
-        raise UNUSABLE[name]
     if name in MODELS:
         return MODELS[name]
+    if name in UNUSABLE:
+        raise UNUSABLE[name]
     file, wanted = file_and_class(name) or ("", name)
     path = Path(file)
     refuse_special(path)

@@ -138,6 +138,12 @@ class Operation:
         """The values that it reads, with ranges, in the order of the fields."""
         return self.named("value")
 
+    @staticmethod
+    def kinds() -> list[type[Operation]]:
+        """All operations of the project."""
+        room = __name__.rpartition(".")[0]
+        return [kind for kind in Operation.__subclasses__() if kind.__module__.startswith(room)]
+
     def arguments(self, read: Callable[[str, slice], V]) -> list[V | list[V] | None]:
         """What its fields say of values, in their order.
 

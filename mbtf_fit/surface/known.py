@@ -77,8 +77,7 @@ class KnownSurface:
     maps : tuple of (rows, columns, channels) tensors
         Prefiltered maps by level, coarsest first: levels 0 to k, or to k + 1 where lookups are finer.
     horizons : tuple of (rows, columns, 2·azimuths) tensors
-        Prefiltered horizon angles in radians by level, then their squares: levels 0 to k, or to k - 1 in the
-        format ``bc4``.
+        Prefiltered horizon angles in radians by level, then their squares: levels 0 to k.
     light_width : RMS angle per axis of the light kernel, in radians
     dielectric : F0 of the surface where it is no metal
     fibers : tuple of (rows, columns, 7) tensors
@@ -157,7 +156,7 @@ class KnownSurface:
             raise ValueError(f"'{MAPS}.0'")
         stored = range(finer.finest + (f"{MAPS}.{finer.finest}" in tensors))
         fibers = stored if f"{FIBERS}.0" in tensors else ()
-        levels = range(max(1, lattice.finest + (f"{HORIZONS}.{lattice.finest}" in tensors)))
+        levels = range(lattice.finest + 1)
         return cls(
             lattice,
             heights,

@@ -99,7 +99,8 @@ def run(
         loaded = preset_recipe(recipe, quality, own)
         if dry_run:
             RUN.check(folder)
-            stages = {name: reason or UP_TO_DATE for name, reason in survey(loaded, folder).items()}
+            found = survey(loaded, folder).items()
+            stages = {name: "forced" if force else reason or UP_TO_DATE for name, reason in found}
             console.report({"stages": stages}, "\n".join(f"{name}: {why}" for name, why in stages.items()))
             return
         keep_on_interruption(f"the finished stages are kept in {folder}")

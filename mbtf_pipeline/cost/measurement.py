@@ -27,7 +27,7 @@ FOLDER, CONFIG_NAME, WORK = "measurements", "generate.yaml", ".work"
 _CONFIGURATIONS = 35
 ESTIMATES = ("seconds", "error", "bias", "noise")
 # Relative standard deviation of a run over seeds before any run is repeated, and the degrees of freedom that
-# it counts for: studies of four materials found 1.5 to 6% (docs/results/cost.md).
+# it counts for: studies of four materials found 1.5 to 6% (docs/how-to/measure-cost.md).
 PRIOR, PRIOR_DEGREES = 0.05, 4
 
 

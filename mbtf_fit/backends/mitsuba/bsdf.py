@@ -144,7 +144,7 @@ class MbtfBSDF(mi.BSDF):
         )
 
     def footprint(self, si: SurfaceInteraction3f) -> Float:
-        """σ at hits in tile widths, from the area of a pixel on the surface."""
+        """σ at hits in tile widths, from the area of a sample of a pixel on the surface."""
         dx, dy = uv_partials(si)
         area = dr.abs(dx.x * dy.y - dx.y * dy.x) * self.uv_scale.x * self.uv_scale.y
         return dr.select(area > 0, pixel_sigma(area), self.sigma)

@@ -112,10 +112,7 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
             where=loader.stored.folder / WEIGHTS_NAME,
         )
     maps = loader.maps(op.maps, channels)
-    # The finest level may be absent.
-    grids = loader.grids()
-    grids = grids if f"{op.horizons}.{len(grids) - 1}" in loader.stored.tensors else grids[:-1] or grids
-    levels = loader.levels(op.horizons, grids, 2 * AZIMUTHS)
+    levels = loader.levels(op.horizons, loader.grids(), 2 * AZIMUTHS)
     horizons = Textures([adjacent_azimuths(level) for level in levels], by_group=True)
     width, f0 = loader.scalar(op.light_width), loader.scalar(op.dielectric)
     dielectric, grazing = opaque(f0), opaque(grazing_reflectance(f0))

@@ -40,17 +40,6 @@ def test_the_error_is_that_of_the_prediction_alone(shards: Path, tmp_path: Path)
     assert math.isclose(errors["unexplained"]["value"], OFFSET**2 / value.var(0).mean(), rel_tol=0.3)
 
 
-def test_spikes_are_named_with_a_remedy(
-    shards: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    value = exact(shards)
-    value[7] = 1e4
-    np.savez(tmp_path / "mine.npz", value=value)
-    assert run(app, ["evaluate", str(tmp_path / "mine.npz"), str(shards)]) == 0
-    assert "1e+04 predicted for" in (shown := capsys.readouterr().out)
-    assert "add the loss 'squared'" in shown
-
-
 def test_foreign_predictions_are_scored_without_the_fitter(
     shards: Path, tmp_path: Path, run_python: RunPython
 ) -> None:

@@ -11,6 +11,7 @@ import imagecodecs
 import numpy as np
 import pytest
 from PIL import Image
+from safetensors.numpy import load_file
 from support.plugin_materials import write_material
 
 from mbtf_core.app.console import CONSOLE, run
@@ -35,6 +36,8 @@ def test_hardware_textures_are_those_of_the_material(model: str, tmp_path: Path)
     assert material.texture_format == "bc4"
     weights = material.model.weights()
     ranges = json.loads((tmp_path / "out" / "layers.json").read_text())["ranges"]
+    stored = load_file(tmp_path / "out" / "weights.safetensors")
+    assert all(np.allclose(found, stored[f"{name}.range"], rtol=1e-6) for name, found in ranges.items())
     fibers = {"surface.fibers"} if model == "cloth" else set()
     assert {"pyramid", "surface.maps", "surface.horizons", "surface.heights"} | fibers == ranges.keys()
     for name in ("pyramid", *fibers):
