@@ -7,9 +7,10 @@ from __future__ import annotations
 import importlib
 import pkgutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from traceback import extract_tb
 from types import ModuleType
@@ -39,26 +40,27 @@ def _find() -> tuple[dict[str, type[Model]], dict[str, InputError]]:
             if own and "name" in vars(item):
                 found[item.name] = item
     for name, point in FOREIGN.items():
-        why, model, cause = "", None, None
         try:
-            model = point.load()
+            found[name] = _foreign(name, point, found)
         except (Exception, SystemExit) as error:  # whatever the code of others raises
-            why, cause = reason(error), error
-        if not why and not (isinstance(model, type) and issubclass(model, Model)):
-            why = f"{point.value} is no model"
-        elif not why and (named := getattr(model, "name", "")) != name:
-            why = f"{point.value} has the name '{named}', which must be that of the entry point"
-        elif not why and name in found:
-            why = "a model of this project has the same name"
-        elif not why and not hasattr(model, "description"):
-            why = f"{point.value} has no description"
-        if why:
             where, hint = f"entry point '{name}' of mbtf.models", "correct or uninstall its package"
-            faults[name] = InputError(f"cannot be used ({why})", where=where, hint=hint)
-            faults[name].__cause__ = cause
-        else:
-            found[name] = model
+            faults[name] = InputError(f"cannot be used ({reason(error)})", where=where, hint=hint)
+            faults[name].__cause__ = error
     return found, faults
+
+
+def _foreign(name: str, point: EntryPoint, known: Container[str]) -> type[Model]:
+    """The model of an entry point; a ValueError where it is none, or its name that of a known one."""
+    model = point.load()
+    if not (isinstance(model, type) and issubclass(model, Model)):
+        raise ValueError(f"{point.value} is no model")
+    if (named := getattr(model, "name", "")) != name:
+        raise ValueError(f"{point.value} has the name '{named}', which must be that of the entry point")
+    if name in known:
+        raise ValueError("a model of this project has the same name")
+    if not hasattr(model, "description"):
+        raise ValueError(f"{point.value} has no description")
+    return model
 
 
 MODELS, UNUSABLE = _find()
