@@ -11,7 +11,7 @@ from mbtf_core.extras import import_extra
 from mbtf_fit.export.images import BASE_COLOR, COAT, HEIGHT, NORMAL, ORM, document_target
 
 if TYPE_CHECKING:
-    from mbtf_fit.material.maps import Maps
+    from mbtf_fit.maps.maps import Maps
 
 _NAME = "material.gltf"
 

@@ -17,7 +17,7 @@ from mbtf_core.paths import real_path
 from mbtf_fit.export import Export, ExportTarget, flags
 
 if TYPE_CHECKING:
-    from mbtf_fit.material.maps import Maps
+    from mbtf_fit.maps.maps import Maps
 
 BASE_COLOR, NORMAL, ORM, HEIGHT = "base_color.png", "normal.png", "roughness_metallic.png", "height.png"
 COAT = "clearcoat.png"
@@ -67,7 +67,7 @@ def write_maps(
     if not has_extra(module):
         raise extra_error(module, name)
     if "maps" not in export.shared:
-        from mbtf_fit.material.maps import make_maps
+        from mbtf_fit.maps.maps import make_maps
 
         maps, unexplained = make_maps(export.material, options.level, export.console)
         export.shared["maps"] = maps, write_images(maps, export.folder)

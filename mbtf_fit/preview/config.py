@@ -1,4 +1,4 @@
-"""Configuration of `mbtf-fit preview` and ``mbtf-fit compare``."""
+"""Configuration of ``mbtf-fit preview`` and ``mbtf-fit compare``."""
 
 from __future__ import annotations
 

@@ -24,8 +24,8 @@ from mbtf_core.data.lattice import sigma_of_level
 from mbtf_core.directions import from_projected_disk
 from mbtf_fit import ops
 from mbtf_fit.material.inference import predict
-from mbtf_fit.material.reference_values import one_thread_each
 from mbtf_fit.material.sampler import Sampler
+from mbtf_fit.objective.parallel import one_thread_each
 from mbtf_fit.ops.operation import SAMPLER
 from mbtf_fit.ops.sampler import LARGEST_LOG, LARGEST_WEIGHT, LEAST_ALPHA, sampler_of
 from mbtf_fit.pytorch.material import NeuralMaterial

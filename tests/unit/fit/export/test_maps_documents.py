@@ -19,7 +19,7 @@ from mbtf_core.app.console import run
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit.cli.app import app
-from mbtf_fit.material.maps import scale_color, surface_maps
+from mbtf_fit.maps.maps import scale_color, surface_maps
 from mbtf_fit.material.material import Material
 from mbtf_fit.material.transmittance import Transmittance
 

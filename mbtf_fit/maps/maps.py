@@ -2,7 +2,7 @@ r"""Maps of the metallic-roughness model of glTF 2.0 for a material.
 
 They are those of the surface that the model traces. The scatter of slopes below the texels of a level widens
 the lobe (:mod:`mbtf_fit.surface.slopes`). Maps of models that know no surface are fitted to their values
-(:mod:`~mbtf_fit.material.brdf_fit`). Maps show no shadows, interreflection or parallax of their own. Their
+(:mod:`~mbtf_fit.maps.brdf_fit`). Maps show no shadows, interreflection or parallax of their own. Their
 base color is therefore scaled until the mean reflectance of the tile, over cosine-weighted lights and views,
 is that of the neural material.
 """
@@ -22,9 +22,8 @@ from mbtf_core.data.lattice import texel_centers
 from mbtf_core.data.schema import CLEARCOAT_F0
 from mbtf_core.errors import UsageError
 from mbtf_core.stats import Estimate, unexplained_variance
-from mbtf_fit.material.brdf_fit import BASE, METALLIC, ROUGHNESS, SLOPES, Pairs, fit_tile, reflectance
-from mbtf_fit.material.material import Material
-from mbtf_fit.material.reference_values import (
+from mbtf_fit.maps.brdf_fit import BASE, METALLIC, ROUGHNESS, SLOPES, Pairs, fit_tile, reflectance
+from mbtf_fit.maps.reference_values import (
     direction_pairs,
     followed,
     least_cosine,
@@ -32,6 +31,7 @@ from mbtf_fit.material.reference_values import (
     texel_values,
     tile_means,
 )
+from mbtf_fit.material.material import Material
 from mbtf_fit.ops.constants import (
     COATED_CHANNELS,
     DIELECTRIC,

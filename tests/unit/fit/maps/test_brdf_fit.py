@@ -14,15 +14,15 @@ from support.plugin_materials import write_material
 
 from mbtf_core.app.console import Console
 from mbtf_core.data.lattice import Lattice, texel_centers
-from mbtf_fit.material.brdf_fit import fit_texels
-from mbtf_fit.material.maps import Maps, fitted_maps, scale_color, unexplained
-from mbtf_fit.material.material import Material
-from mbtf_fit.material.reference_values import (
+from mbtf_fit.maps.brdf_fit import fit_texels
+from mbtf_fit.maps.maps import Maps, fitted_maps, scale_color, unexplained
+from mbtf_fit.maps.reference_values import (
     direction_pairs,
     followed,
     steep_views,
     tile_means,
 )
+from mbtf_fit.material.material import Material
 from mbtf_fit.material.transmittance import Transmittance
 
 

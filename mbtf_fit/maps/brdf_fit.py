@@ -34,17 +34,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mbtf_core.data.lattice import texel_centers
-from mbtf_fit.material.material import Material
-from mbtf_fit.material.reference_values import (
+from mbtf_fit.maps.reference_values import (
     LEAST_OPACITY,
     direction_pairs,
     followed,
     highlight_pairs,
     least_cosine,
-    one_thread_each,
     solid_values,
     steep_views,
 )
+from mbtf_fit.material.material import Material
+from mbtf_fit.objective.parallel import one_thread_each
 
 F64 = NDArray[np.float64]
 # F0 of a dielectric of refractive index 1.5.

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -25,17 +22,6 @@ _HIGHLIGHT = (0.01, 0.6)
 _ITERATIONS = 4
 # Least divisor of values.
 LEAST_OPACITY = 0.05
-
-
-@contextmanager
-def one_thread_each() -> Iterator[None]:
-    """PyTorch with one thread per operation, as small ones lose time waiting."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(count)
 
 
 def least_cosine(material: Material) -> float:

@@ -16,8 +16,8 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import UsageError
 from mbtf_fit import Material, ops
-from mbtf_fit.material.maps import Maps, knows_surface, make_maps, scale_color, surface_maps
-from mbtf_fit.material.reference_values import direction_pairs, tile_means
+from mbtf_fit.maps.maps import Maps, knows_surface, make_maps, scale_color, surface_maps
+from mbtf_fit.maps.reference_values import direction_pairs, tile_means
 from mbtf_fit.ops.constants import HEIGHTS
 from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.surface.known import KnownSurface
