@@ -133,7 +133,7 @@ class Product(Operation):
 
 def calibrated(operations: Sequence[Operation]) -> list[Operation]:
     """A list whose value is scaled by the calibration factors of light and view, tensor ``calibration``."""
-    factors = ("by_view", "omega_o", 1), ("by_light", "omega_i", 0)
-    tables = [Calibrate(name, "level", omega, "calibration", table) for name, omega, table in factors]
-    names = operations[-1].output, *(table.output for table in tables)
-    return [*operations, *tables, Product("calibrated", names)]
+    directions = ("by_view", "omega_o", 1), ("by_light", "omega_i", 0)
+    factors = [Calibrate(name, "level", omega, "calibration", table) for name, omega, table in directions]
+    names = operations[-1].output, *(factor.output for factor in factors)
+    return [*operations, *factors, Product("calibrated", names)]

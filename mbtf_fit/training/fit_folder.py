@@ -41,8 +41,8 @@ def identity_of(config: FitConfig, data: Dataset, group: Sequence[Dataset] = ())
     # Other data sets count by what they hold, not by where they lie.
     others = tuple(Dataset.open(folder).manifest["config_hash"] for folder in config.training.materials)
     training = config.training.model_copy(update={"materials": others})
-    located = config.model_copy(update={"training": training})
-    config_hash = located.hash(data_sha256({**described, "files": files}))
+    without_paths = config.model_copy(update={"training": training})
+    config_hash = without_paths.hash(data_sha256({**described, "files": files}))
     # A model whose operations or file have changed is another one.
     operations = operations_of(config.model, data.lattice, config.network)
     model = data_sha256([operation.as_json() for operation in operations])
