@@ -115,8 +115,9 @@ def seen(name: str, tiles: float) -> tuple[Chart | DisplacedMesh, Camera, Camera
 
 def compared(found: Any, expected: Any, shadows: tuple[Any, Any]) -> str:
     """What is printed of a picture and its reference."""
-    shown = blocks(expected) > 0
-    rms = np.sqrt(((blocks(found) - blocks(expected))[shown] ** 2).mean()) / blocks(expected)[shown].mean()
+    a, b = blocks(found), blocks(expected)
+    shown = b > 0
+    rms = np.sqrt(((a - b)[shown] ** 2).mean()) / b[shown].mean()
     inside = (expected.transmittance < 0.5) & (found.transmittance < 0.5)
     gray = [image.value.mean(-1)[inside] for image in (found, expected)]
     contrast = [values.std() / values.mean() for values in gray]

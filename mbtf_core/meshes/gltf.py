@@ -129,8 +129,8 @@ def _check_pose(node: GltfNode, mesh: GltfMesh, file: GltfFile) -> None:
         hint = "apply the armature and export it again"
         raise InputError(f"'{name}' is posed by a skeleton, which is not read", where=file.path, hint=hint)
     if node.instancing is not None:
-        what, hint = f"'{name}' has GPU instances, which are not read", "export them as nodes"
-        raise InputError(what, where=file.path, hint=hint)
+        hint = HINTS["EXT_mesh_gpu_instancing"]
+        raise InputError(f"'{name}' has GPU instances, which are not read", where=file.path, hint=hint)
     if any(node.weights or mesh.weights):
         hint = "apply the shape keys and export it again"
         raise InputError(f"'{name}' is a blend of morph targets, not read", where=file.path, hint=hint)

@@ -25,7 +25,6 @@ from mbtf_core.app.options import (
 from mbtf_core.app.progress import Progress
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.run.signals import keep_on_interruption
-from mbtf_fit.cli.evaluate import advise
 from mbtf_fit.config import DEFAULT_MODEL, FitConfig, ModelName, best_model
 from mbtf_fit.formatting import describe_fit, fits_table
 
@@ -110,6 +109,7 @@ def _fit_one(
     from mbtf_fit.material.format import DESCRIPTION_NAME
     from mbtf_fit.training.endings import describe_ending, describe_kept
     from mbtf_fit.training.fit import fit
+    from mbtf_fit.training.next_step import advise
 
     finished = not overwrite and (output / DESCRIPTION_NAME).exists()
     if not finished:

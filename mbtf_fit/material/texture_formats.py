@@ -109,7 +109,8 @@ def encode(name: str, levels: Sequence[F32], form: TextureFormat) -> tuple[list[
     """
     limits = range_of(name, levels)
     low, high = limits.astype(np.float64)
-    scale = np.where(high > low, 1.0 / np.maximum(high - low, 1e-30), 0.0)
+    span = high - low
+    scale = np.divide(1.0, span, out=np.zeros_like(span), where=span > 0.0)
     shares = [np.clip((x - low) * scale, 0.0, 1.0) for x in levels]
     if name == HEIGHTS:
         codes: list[NDArray[Any]] = [np.rint(65535.0 * x).astype(np.uint16) for x in shares]

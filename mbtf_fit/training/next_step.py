@@ -5,10 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+from mbtf_core.data.dataset import Dataset
 from mbtf_fit.formatting import headline, unreliable
-from mbtf_fit.training.validation import FEWEST_STEPS, FLAT, MarginalCost
+from mbtf_fit.training.endings import reached
+from mbtf_fit.training.fit_folder import training_digest
+from mbtf_fit.training.validation import FEWEST_STEPS, FLAT, MarginalCost, marginal_cost_of
+
+if TYPE_CHECKING:
+    from mbtf_core.data.folder import DataFolder
+    from mbtf_fit.material.material import Material
 
 # Below so many steps, the error itself says little; few steps with a larger error are not enough.
 _UNTRAINED, _HARDLY = 100, 0.5
@@ -94,3 +101,29 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
 def _at_best(factor: float) -> str:
     # Of cloth by few noisy queries, twice as many have left 0.69 to 0.99 of the error.
     return f"expect {factor:.2g} to 1 of this error with twice the queries"
+
+
+def suggest(material: Material, history: list[dict[str, Any]], errors: dict[str, Any]) -> NextStep | None:
+    """What reduces the error of a fit most, from the records of its validations and its errors by split. None
+    where it is unfinished, has reached the error that it was asked for, or shares a network."""
+    config, training = material.config, material.description["training"]
+    cost = marginal_cost_of(history, errors, training)
+    if cost is None or not errors or config.training.shared_decoder or reached(config, history):
+        return None
+    return next_step(cost, errors)
+
+
+def advise(
+    material: Material,
+    shards: DataFolder,
+    history: list[dict[str, Any]],
+    errors: dict[str, Any],
+) -> str | None:
+    """One line on what reduces the error of a fit most, by its errors on a data set; None where
+    :func:`suggest` has none."""
+    step = suggest(material, history, errors)
+    if step is None:
+        return None
+    if material.description["training"]["shards_sha256"] != training_digest(Dataset.open(shards)):
+        return "the fit had other training data; evaluate it on them for advice"
+    return step.reason

@@ -141,10 +141,10 @@ def _report_collection(done: CollectionResult, folder: Path, console: Console) -
 
 def _report(result: RunResult, console: Console, quality: Quality | None) -> None:
     from mbtf_fit import Material
-    from mbtf_fit.cli.evaluate import suggest
     from mbtf_fit.formatting import outliers, unreliable
     from mbtf_fit.training.endings import describe_ending
     from mbtf_fit.training.fit_folder import read_history
+    from mbtf_fit.training.next_step import suggest
     from mbtf_fit.training.validation import caveat
     from mbtf_pipeline.recipe import read_resolved
     from mbtf_pipeline.stages import FITS
