@@ -209,6 +209,12 @@ class Dataset:
         return int(self.manifest.get("estimates", 2))
 
     @property
+    def light_width(self) -> float | None:
+        """RMS angle per axis of the light kernel, in degrees; None where the data set does not say."""
+        width = ((self.manifest.get("config") or {}).get("light") or {}).get("width")
+        return None if width is None else float(width)
+
+    @property
     def weighted(self) -> bool:
         """Whether test queries have weights, the array ``weight``."""
         return "weight" in self.manifest.get("arrays", {})

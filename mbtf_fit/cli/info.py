@@ -55,7 +55,7 @@ def _shards_info(folder: DataFolder) -> tuple[dict[str, Any], str]:
     manifest = data.manifest
     config, measured = manifest.get("config") or {}, manifest.get("measured")
     material = measured["file"] if measured else config.get("material")
-    width = (config.get("light") or {}).get("width")
+    width = data.light_width
     least = (config.get("queries") or config).get("min_cos")
     noise = (manifest.get("summary") or {}).get("relative_error")
     light = (

@@ -81,7 +81,7 @@ class LearnedRelief(Relief):
         self._filtered: Tensor | None = None
 
     def prepare(self, given: Preparation) -> Any:
-        self.light_width = given.light_width
+        self.light_width = given.data.light_width or 0.0
         self.follow(0, 0.0)
         return given.queries
 

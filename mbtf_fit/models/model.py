@@ -57,12 +57,6 @@ class Preparation:
     seed: int
     load: Any
 
-    @property
-    def light_width(self) -> float:
-        """RMS angle per axis of the light kernel, in degrees; 0 where the data set does not say."""
-        config: Any = self.data.manifest.get("config") or {}
-        return float((config.get("light") or {}).get("width") or 0.0)
-
 
 class Model:
     """A model: what it computes, and how it is trained. An object accompanies one training.

@@ -117,7 +117,8 @@ class Relief(Model):
 
         geometry = given.data.geometry()
         assert geometry is not None
-        self.material.know(KnownSurface.of(geometry, given.data.lattice, given.light_width))
+        width = given.data.light_width or 0.0
+        self.material.know(KnownSurface.of(geometry, given.data.lattice, width))
         return given.queries
 
     def precompute(self, queries: Any, memory: float) -> Any:

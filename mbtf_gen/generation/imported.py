@@ -21,17 +21,16 @@ from mbtf_core.data.shard_files import Arrays
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, file_sha256
 from mbtf_core.files.folders import owned
-from mbtf_core.paths import opened
 from mbtf_gen.config.exchange import ImportConfig
 from mbtf_gen.config.generator import count_queries
 from mbtf_gen.generation.folder import claim_folder
 from mbtf_gen.generation.manifest import Summary, finish, new_manifest
 from mbtf_gen.generation.shard_record import store_shard
 from mbtf_gen.job import shard_entries
-from mbtf_gen.measured.hdf5 import COLOR, MAGIC, NeumipQueries, hdf5_file
+from mbtf_gen.measured.hdf5 import NeumipQueries
 from mbtf_gen.measured.interface import MeasuredBtf
-from mbtf_gen.measured.ubo2003 import SUFFIXES, Ubo2003
-from mbtf_gen.measured.ubo2014 import Ubo2014
+from mbtf_gen.measured.kinds import open_measured
+from mbtf_gen.measured.ubo2003 import SUFFIXES
 from mbtf_gen.sampling.rng import Purpose, numpy_generator
 
 I64 = NDArray[np.int64]
@@ -56,7 +55,6 @@ MEASURED_CONVENTIONS = {
 TEST_PAIRS = 0.05
 # Queries of a list that are read at once.
 _BLOCK = 1 << 22
-_KNOWN = "a .btf file (Bonn, DFMF), a folder or zip of photographs named by angles, or HDF5 of NeuMIP"
 
 
 class Import(ABC):
@@ -316,25 +314,3 @@ def _digest(path: Path) -> str:
         return file_sha256(path)
     files = sorted(p for p in path.rglob("*") if p.suffix.lower() in SUFFIXES and p.is_file())
     return data_sha256({p.relative_to(path).as_posix(): file_sha256(p) for p in files})
-
-
-def open_measured(path: str | Path) -> MeasuredBtf | NeumipQueries:
-    """Open a measured BTF or a data set of another program; an InputError if the file is missing, of no known
-    kind, or damaged."""
-    path = Path(path)
-    if path.is_dir():
-        return Ubo2003(path)
-    with opened(path) as stream:
-        start = stream.read(len(MAGIC))
-    if start.startswith(b"!"):
-        return Ubo2014(path)
-    if start.startswith(b"PK"):
-        return Ubo2003(path)
-    if not start.startswith(MAGIC):
-        what = "is not a measured BTF of a known kind"
-        raise InputError(what, where=path, hint=f"download or unpack it again; known are {_KNOWN}")
-    with hdf5_file(path) as file:
-        names = set(file)
-    if COLOR not in names:
-        raise InputError(f"is an HDF5 file without '{COLOR}'", where=path, hint=f"known are {_KNOWN}")
-    return NeumipQueries(path)

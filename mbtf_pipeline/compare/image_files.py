@@ -92,8 +92,8 @@ _HALVES = [f"value_{half}.{color}" for half in "ab" for color in "RGB"]
 
 
 def read_picture(path: Path) -> F32:
-    """Linear RGB (rows, columns, 3) of ``path`` + ``.exr``, of a reference the mean of its halves; errors are
-    those of :func:`read_channels`."""
+    """Linear RGB (rows, columns, 3) of a comparison's picture, ``path`` + ``.exr``: of a reference the mean
+    of its halves; errors are those of :func:`read_channels`."""
     found = read_channels(with_ending(path, ".exr"), "RGB", _HALVES)
     return found if found.shape[-1] == 3 else 0.5 * (found[..., :3] + found[..., 3:])
 
