@@ -92,7 +92,9 @@ def report_errors(
     ]
     if transmittance:
         through = next(iter(transmittance.values()))
-        others.append(f"rms error of transmittance {max(0.0, through['mse']['value']) ** 0.5:.3f}")
+        square, noise = (through[name]["value"] for name in ("mse", "noise"))
+        least, most = (max(0.0, x) ** 0.5 for x in (square - noise, square))
+        others.append(f"rms error of transmittance {least:.3f} ({most:.3f} with the noise of its estimates)")
     lines += [", ".join(others)] if others else []
     return [*lines, *_remarks(errors, foreign), *(_table_of(errors) if verbose else [])]
 

@@ -47,8 +47,8 @@ def render(material: str, options: str, size: int, spp: int, output: Path) -> Im
 
 def sheet(pictures: dict[str, Image.Image], across: int) -> Image.Image:
     """Pictures with titles above, so many across."""
-    size = next(iter(pictures.values())).width
-    wide, high = size + GAP, size + GAP + TITLE
+    first = next(iter(pictures.values()))
+    wide, high = first.width + GAP, first.height + GAP + TITLE
     out = Image.new("RGB", (across * wide - GAP, -(-len(pictures) // across) * high - GAP), PAPER)
     draw, font = ImageDraw.Draw(out), ImageFont.load_default(15)
     for number, (title, picture) in enumerate(pictures.items()):

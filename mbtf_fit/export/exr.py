@@ -9,6 +9,7 @@ import numpy as np
 
 from mbtf_core.files.atomic import write_through
 from mbtf_fit.export import Export, ExportTarget
+from mbtf_fit.material.transmittance import named_levels
 
 if TYPE_CHECKING:
     from mbtf_fit.material.material import Material
@@ -25,10 +26,10 @@ def channel_names(part: str, count: int) -> list[str]:
 
 def texture_parts(material: Material) -> dict[str, Any]:
     """Part → texture (rows, columns, channels), coarsest level first: ``pyramid.0``, …,
-    ``offset_texture.0``, ``transmittance.0``, …"""
+    ``offset_texture.0``, ``transmittance.0.0``, … (layer and level)."""
     parts = {name: t.cpu().numpy() for name, t in material.model.weights().items() if t.ndim == 3}
-    levels = [] if material.transmittance is None else material.transmittance.levels
-    return parts | {f"transmittance.{s}": texels for s, texels in enumerate(levels)}
+    layers = {} if material.transmittance is None else named_levels(material.transmittance)
+    return parts | {f"transmittance.{name}": texels for name, texels in layers.items()}
 
 
 def write(export: Export, options: None) -> list[str]:

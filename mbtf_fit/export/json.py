@@ -12,7 +12,7 @@ from mbtf_fit.export import Export, ExportTarget
 from mbtf_fit.material.texture_formats import QUANTIZED, grouped, range_of
 
 LAYERS_NAME = "layers.json"
-_SCHEMA = 6
+_SCHEMA = 7
 
 
 def _numbers(array: Any) -> Any:
@@ -46,7 +46,11 @@ def write(export: Export, options: None) -> list[str]:
         "textures": [name for name, tensor in weights.items() if tensor.ndim == 3],
         "tensors": {name: _numbers(tensor.cpu()) for name, tensor in weights.items() if tensor.ndim != 3},
         **({"ranges": ranges} if ranges else {}),
-        **({} if through is None else {"transmittance": FORMULA}),
+        **(
+            {}
+            if through is None
+            else {"transmittance": {"depths": _numbers(through.depths), "formula": FORMULA}}
+        ),
         "conformance": {
             **{name: _numbers(array) for name, array in expected.items()},
             "tolerance": material.description["conformance"]["tolerance"],

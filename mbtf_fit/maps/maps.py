@@ -156,8 +156,7 @@ def opacity_of(material: Material, level: int) -> F64:
     """Opacity (rows, columns) towards the normal of the texels of a level."""
     if material.transmittance is None:
         return np.ones(material.lattice.shape(level))
-    through = np.clip(material.transmittance.levels[level][..., 0], 0.0, 1.0)
-    return 1.0 - through.astype(np.float64)
+    return 1.0 - material.transmittance.from_above(level).astype(np.float64)
 
 
 def surface_maps(material: Material, level: int) -> Maps:

@@ -93,9 +93,11 @@ def round_material(material: Material, form: TextureFormat) -> tuple[Material, R
     model.load_weights(round_weights(weights, form))
     transmittance = material.transmittance
     if transmittance is not None and form != "float32":
-        levels = enumerate(map(torch.from_numpy, transmittance.levels))
-        halves = [_round_to_half(f"transmittance.{s}", texels).numpy() for s, texels in levels]
-        transmittance = replace(transmittance, levels=halves)
+        layers = [
+            [_round_to_half("transmittance", torch.from_numpy(texels)).numpy() for texels in levels]
+            for levels in transmittance.layers
+        ]
+        transmittance = replace(transmittance, layers=layers)
     after = conformance_values(model, material.conformance)
     error = RoundingError.between(form, material.conformance["rgb"], after)
     conformance = {**material.conformance, "rgb": after}

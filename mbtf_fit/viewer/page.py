@@ -148,7 +148,7 @@ def as_read(material: Material, packed: dict[str, PackedTexture]) -> Material:
     """The material with the textures that a page holds."""
     weights = material.model.weights()
     for image in program_of(material, GLSL).images:
-        if image.source in packed and image.source != TRANSMITTANCE:
+        if image.source in packed and not image.source.startswith(TRANSMITTANCE):
             for level, texels in enumerate(packed[image.source].levels):
                 name = image.source if image.layout == "nodes" else f"{image.source}.{level}"
                 weights[name] = torch.from_numpy(_restored(image.layout, texels))
@@ -156,7 +156,8 @@ def as_read(material: Material, packed: dict[str, PackedTexture]) -> Material:
     model.load_weights(weights)
     transmittance = material.transmittance
     if transmittance is not None:
-        transmittance = replace(transmittance, levels=list(packed[TRANSMITTANCE].levels))
+        layers = [list(packed[f"{TRANSMITTANCE}.{k}"].levels) for k in range(len(transmittance.depths))]
+        transmittance = replace(transmittance, layers=layers)
     rgb = conformance_values(model, material.conformance)
     return replace(
         material, model=model, conformance={**material.conformance, "rgb": rgb}, transmittance=transmittance

@@ -121,8 +121,10 @@ def make(case: str, folder: Path, **more: Any) -> Material:
         }
     if case == "holes":
         shapes = [(*lattice.shape(s), 6) for s in range(5)]
-        coefficients = [0.3 + 0.2 * torch.randn(s, generator=generator).numpy() for s in shapes]
-        options["transmittance"] = Transmittance(lattice, coefficients)
+        layers = [
+            [0.15 + 0.1 * torch.randn(s, generator=generator).numpy() for s in shapes] for _ in range(2)
+        ]
+        options["transmittance"] = Transmittance(lattice, (-0.05, -0.2), layers)
     material = write_material(folder, **options)
     if not case.endswith("in blocks"):
         return material

@@ -17,6 +17,7 @@ from mbtf_fit.backends.mitsuba.mixture import Mixture
 from mbtf_fit.backends.mitsuba.stored_material import F32, StoredMaterial
 from mbtf_fit.backends.mitsuba.textures import Textures
 from mbtf_fit.material.format import DESCRIPTION_NAME
+from mbtf_fit.material.transmittance import LEAST_COSINE
 from mbtf_fit.ops import Operation, Shade, Trace, stages
 from mbtf_fit.ops.operation import SAMPLER, output_names
 from mbtf_fit.ops.sampler import sampler_sizes
@@ -66,7 +67,9 @@ class Evaluator:
         self._first, self._second, self._last = first, second, stored.operations[-1].output
         self._sampler = [(op, MITSUBA[op](op, loader)) for op in stored.sampler]
         self._shaded = next((op.output for op in stored.operations if isinstance(op, Shade)), None)
-        self._coefficients = None if stored.transmittance is None else Textures(stored.transmittance)
+        through = stored.transmittance
+        layers = [] if through is None else zip(through.depths, through.layers, strict=True)
+        self._through = [(z, Textures(levels)) for z, levels in layers]
 
     def level(self, sigma: Float) -> Float:
         """Fractional level of footprints in tile widths."""
@@ -117,11 +120,12 @@ class Evaluator:
     def transmittance(self, u: Point2f, level: Float, omega_o: Vector3f) -> Float:
         """Transparent fraction of the footprint for unit vectors on either side of the plane, equal for
         opposite ones. The formula is that of :mod:`mbtf_fit.material.transmittance`."""
-        if self._coefficients is None:
-            return mi.Float(0.0)
         x, y = (dr.mulsign(w, omega_o.z) for w in (omega_o.x, omega_o.y))
-        c = self._coefficients.blended(u, level)
-        found = c[0] + c[1] * x + c[2] * y + c[3] * x * x + c[4] * x * y + c[5] * y * y
+        cosine, found = dr.maximum(dr.abs(omega_o.z), LEAST_COSINE), mi.Float(0.0)
+        for z, layer in self._through:
+            t = z / cosine
+            c = layer.blended(mi.Point2f(u.x + t * x, u.y + t * y / self.lattice.aspect), level)
+            found += c[0] + c[1] * x + c[2] * y + c[3] * x * x + c[4] * x * y + c[5] * y * y
         return dr.clip(found, 0.0, 1.0)
 
     def evaluate(self, u: ArrayLike, sigma: ArrayLike, omega_i: ArrayLike, omega_o: ArrayLike) -> F32:

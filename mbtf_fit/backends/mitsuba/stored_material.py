@@ -22,7 +22,7 @@ from mbtf_fit.material.format import (
     read_description,
     read_weights,
 )
-from mbtf_fit.material.transmittance import read_transmittance
+from mbtf_fit.material.transmittance import Transmittance, read_transmittance
 from mbtf_fit.ops import Operation, read_operations
 from mbtf_fit.ops.operation import SAMPLER
 from mbtf_fit.ops.sampler import read_sampler
@@ -42,7 +42,7 @@ class StoredMaterial:
     operations : the list that computes the value in 1/sr
     sampler : the list for importance sampling, empty without
     tensors : what the operations read, by name
-    transmittance : coefficients (rows, columns, 6) by level; None for an opaque material
+    transmittance : None for an opaque material
     conformance : queries ``u``, ``sigma``, ``omega_i``, ``omega_o`` and their values ``rgb`` (n, 3)
     """
 
@@ -52,7 +52,7 @@ class StoredMaterial:
     operations: Sequence[Operation]
     sampler: Sequence[Operation]
     tensors: Mapping[str, NDArray[Any]]
-    transmittance: list[F32] | None
+    transmittance: Transmittance | None
     conformance: dict[str, F32]
 
     def take(self, name: str, shape: Sequence[int | None]) -> F32:
@@ -98,7 +98,6 @@ def read_material(folder: str | Path) -> StoredMaterial:
         sampler = [] if found is None else read_sampler(found, operations, tensors)
     except ValueError as error:
         raise InputError(str(error), where=folder / DESCRIPTION_NAME, hint=AGAIN) from None
-    transmittance = read_transmittance(folder, description)
     return StoredMaterial(
         folder,
         lattice_of(description),
@@ -106,6 +105,6 @@ def read_material(folder: str | Path) -> StoredMaterial:
         operations,
         sampler,
         tensors,
-        None if transmittance is None else transmittance.levels,
+        read_transmittance(folder, description),
         check_conformance(tensors, description, weights),
     )

@@ -13,10 +13,11 @@ from mbtf_fit.backends.shader.backend import SHADER, Code, Value
 from mbtf_fit.backends.shader.images import F16, F32, TexelImage
 from mbtf_fit.backends.shader.syntax import Syntax, number
 from mbtf_fit.material.material import Material
+from mbtf_fit.material.transmittance import LEAST_COSINE, named_levels
 from mbtf_fit.ops.operation import INPUTS, SAMPLER, output_names, parse, reached_from
 from mbtf_fit.ops.sampler import BOUNDS, sampler_sizes
 
-# Image of its coefficients.
+# Images of its coefficients, before the layer.
 TRANSMITTANCE = "material.transmittance"
 
 
@@ -53,8 +54,7 @@ def program_of(material: Material, syntax: Syntax, *, sampled: bool = False) -> 
     last = operations[-1].output
     tensors = {name: t.cpu().float().numpy() for name, t in material.model.weights().items()}
     if material.transmittance is not None:
-        levels = enumerate(material.transmittance.levels)
-        tensors |= {f"{TRANSMITTANCE}.{s}": texels for s, texels in levels}
+        tensors |= {f"{TRANSMITTANCE}.{name}": a for name, a in named_levels(material.transmittance).items()}
     sampler = material.sampler if sampled else None
     if sampler is not None:
         tensors |= {name: t.numpy() for name, t in sampler.tensors.items()}
@@ -123,13 +123,16 @@ def _transmittance(material: Material, code: Code, level: str) -> list[str]:
     """Function of the transparent fraction of the footprint (mbtf_fit.material.transmittance)."""
     body = ["  return 0.0;"]
     if material.transmittance is not None:
-        image = code.image(TRANSMITTANCE)
-        body = [
-            f"  Pair p = {code.pair(image, level, 'u - floor(u)')};",
-            f"  float4 a = blended({image}, p, 0), b = blended({image}, p, 1);",
-            "  float2 w = omega_o.xy;",
-            "  float sum = a.x + dot(a.yz, w) + a.w * w.x * w.x + b.x * w.x * w.y + b.y * w.y * w.y;",
-            "  return clamp(sum, 0.0, 1.0);",
-        ]
+        cosine = f"max(omega_o.z, {number(LEAST_COSINE)})"
+        body = ["  float2 w = omega_o.xy, x;", "  float sum = 0.0;", "  float4 a, b;", "  Pair p;"]
+        for k, z in enumerate(material.transmittance.depths):
+            image = code.image(f"{TRANSMITTANCE}.{k}")
+            body += [
+                f"  x = u + {number(z)} / {cosine} * float2(w.x, w.y / ASPECT);",
+                f"  p = {code.pair(image, level, 'x - floor(x)')};",
+                f"  a = blended({image}, p, 0); b = blended({image}, p, 1);",
+                "  sum += a.x + dot(a.yz, w) + a.w * w.x * w.x + b.x * w.x * w.y + b.y * w.y * w.y;",
+            ]
+        body += ["  return clamp(sum, 0.0, 1.0);"]
     head = "float transmittance(float2 u, float sigma, float3 omega_o) {"
     return ["// Transparent fraction of the footprint.", head, *body, "}"]

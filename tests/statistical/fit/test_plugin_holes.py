@@ -27,7 +27,7 @@ def even(finest: int = 2) -> Transmittance:
         texels = np.zeros((2**s, 2**s, 6), np.float32)
         texels[..., 0] = SHARE
         levels.append(texels)
-    return Transmittance(Lattice(finest), levels)
+    return Transmittance(Lattice(finest), (0.0,), [levels])
 
 
 @pytest.fixture(scope="module", params=["neumip", "relief"])
@@ -60,8 +60,11 @@ def test_the_plugin_evaluates_the_fitted_transmittance(tmp_path: Path) -> None:
     """Against NumPy, at all levels, seams and views, from both sides."""
     random = np.random.default_rng(2)
     lattice = Lattice(3, 2.0)
-    levels = [random.normal(0.3, 0.2, (*lattice.shape(s), 6)).astype(np.float32) for s in range(4)]
-    model = Transmittance(lattice, levels)
+    layers = [
+        [random.normal(0.15, 0.1, (*lattice.shape(s), 6)).astype(np.float32) for s in range(4)]
+        for _ in range(2)
+    ]
+    model = Transmittance(lattice, (-0.05, -0.2), layers)
     write_material(tmp_path, finest=3, aspect=2.0, transmittance=model)
     evaluator = Evaluator(read_material(tmp_path), "cooperative")
     q = random_queries(random, 3000, lattice)
@@ -78,7 +81,7 @@ def test_rays_to_and_fro_pass_the_same_holes(tmp_path: Path) -> None:
     random = np.random.default_rng(2)
     lattice = Lattice(2)
     levels = [random.normal(0.3, 0.2, (*lattice.shape(s), 6)).astype(np.float32) for s in range(3)]
-    write_material(tmp_path, finest=2, transmittance=Transmittance(lattice, levels))
+    write_material(tmp_path, finest=2, transmittance=Transmittance(lattice, (-0.1,), [levels]))
     own = {"material": str(tmp_path), "networks": "cooperative", "sampling": "cosine", "two_sided": True}
     bsdf = mi.load_dict({"type": "mbtf", **own})
     there, back = (

@@ -34,7 +34,7 @@ def page(driver: Any, tmp_path_factory: pytest.TempPathFactory) -> Page:
     for coefficients in half:
         coefficients[..., 0] = 0.5
     for name, value in VALUES.items():
-        through = Transmittance(lattice, half) if name == "veil" else None
+        through = Transmittance(lattice, (0.0,), [half]) if name == "veil" else None
         write_material(folder / name, constant=(value,) * 3, model="neumip-baseline", transmittance=through)
     picture = np.full((60, 60, 3), 0.1, np.float32)
     picture[:30, :, 0] = 0.4

@@ -59,10 +59,13 @@ class Reader(NumpyMaterial):
         known = self.document["conformance"]
         u, sigma, omega_o = (np.array(known[k]) for k in ("u", "sigma", "omega_o"))
         level = np.clip(-np.log2(2 * sigma), 0, self.finest)
-        at = zip(u, level[:, None], strict=True)
-        c = np.array([self.lookup(p, s, "transmittance") for p, s in at])
         x, y = omega_o[:, 0], omega_o[:, 1]
-        return np.asarray(np.clip((c * np.stack([x**0, x, y, x * x, x * y, y * y], -1)).sum(-1), 0, 1))
+        total, terms = np.zeros(len(u)), np.stack([x**0, x, y, x * x, x * y, y * y], -1)
+        for k, z in enumerate(self.document["transmittance"]["depths"]):
+            at = u + z / np.maximum(omega_o[:, 2:], 0.05) * np.stack([x, y], -1) / self.scale
+            read = zip(at, level[:, None], strict=True)
+            total += (np.array([self.lookup(p, s, f"transmittance.{k}") for p, s in read]) * terms).sum(-1)
+        return np.clip(total, 0, 1)
 
 
 @pytest.mark.parametrize("form", ["float32", "float16", "bc4"])

@@ -216,7 +216,7 @@ def test_a_surface_without_gloss_with_holes(tmp_path: Path) -> None:
     levels = [np.zeros((*lattice.shape(s), 6), np.float32) for s in range(4)]
     for texels in levels:
         texels[0, :, 0] = 0.75
-    out = exported(tmp_path, glossy=False, transmittance=Transmittance(lattice, levels))
+    out = exported(tmp_path, glossy=False, transmittance=Transmittance(lattice, (0.0,), [levels]))
     alpha = np.asarray(Image.open(out / "base_color.png"))[..., 3]
     assert alpha[0].tolist() == [64] * 8
     assert (alpha[1:] == 255).all()

@@ -156,7 +156,7 @@ def test_values_are_divided_by_what_the_view_meets(tmp_path: Path) -> None:
     levels = [np.zeros((*lattice.shape(s), 6), np.float32) for s in range(3)]
     levels[2][:, :2, 0] = 0.75
     levels[2][3, 3, 0] = 1.0
-    through = Transmittance(lattice, levels)
+    through = Transmittance(lattice, (0.0,), [levels])
     slopes = np.zeros((4, 4, 2))
 
     def premultiplied(texel: np.ndarray, light: np.ndarray, view: np.ndarray) -> np.ndarray:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.fit_data import constant, random_queries, write_data
+from support.fit_data import constant, flat_geometry, random_queries, write_data
 from support.image_data import write_images
 
 from mbtf_core.data.dataset import Dataset
@@ -56,6 +57,37 @@ def test_a_known_transmittance_is_found(tmp_path: Path) -> None:
     assert np.sqrt(np.mean((found - wanted)[fine] ** 2)) < 0.02
 
 
+def test_holes_are_found_at_their_depths(tmp_path: Path) -> None:
+    """Two sheets with holes at depths between those of the layers, seen through one another."""
+    lattice, aspect = Lattice(4, 0.5), 0.5
+    surface = flat_geometry(lattice)
+    heights = np.zeros_like(surface.heights)
+    heights[0, 0] = -0.2
+    geometry = replace(surface, heights=heights)
+
+    def sheets(u: np.ndarray, sigma: np.ndarray, omega_o: np.ndarray) -> np.ndarray:
+        fade, total = np.exp(-2 * (np.pi * sigma) ** 2), np.zeros(len(u))
+        for depth, turn in ((0.07, 0.0), (0.13, 1.0)):
+            at = u - depth / omega_o[:, 2:] * omega_o[:, :2] / (1.0, aspect)
+            total += 0.2 + 0.2 * fade * np.sin(2 * np.pi * at[:, 0] + turn)
+        return total
+
+    data = Dataset.open(
+        write_data(
+            tmp_path, constant(0.2), train=120_000, finest=4, aspect=aspect, through=sheets, geometry=geometry
+        )
+    )
+    model = fit_transmittance(data, chosen(data))
+    assert model is not None
+    assert model.depths == pytest.approx((-0.1, -0.05, -0.15))
+    q = random_queries(np.random.default_rng(9), 4000, lattice)
+    steep = q["omega_o"][:, 2] > 0.3
+    found, wanted = (f(q["u"], q["sigma"], q["omega_o"])[steep] for f in (model.evaluate, sheets))
+    assert wanted.std() > 0.1
+    # A layer at the reference plane alone leaves 0.09.
+    assert np.sqrt(np.mean((found - wanted) ** 2)) < 0.04
+
+
 def test_few_queries_fall_back_on_coarser_levels(tmp_path: Path) -> None:
     """No texel of an empty neighborhood is left without a value."""
     data = Dataset.open(
@@ -81,7 +113,7 @@ def test_a_fit_writes_it_beside_the_weights_and_only_for_holes(tmp_path: Path) -
     fitted = fit_transmittance(data, chosen(data, config.held_out))
     assert read is not None
     assert fitted is not None
-    for mine, theirs in zip(read.levels, fitted.levels, strict=True):
+    for mine, theirs in zip(read.layers[0], fitted.layers[0], strict=True):
         np.testing.assert_array_equal(mine, theirs)
 
 
@@ -107,7 +139,7 @@ def test_held_out_queries_are_evaluated_and_not_fitted(layout: str, tmp_path: Pa
         write_shard(path, {**arrays, "transmittance": through})
     after = fit_transmittance(data, selection)
     assert after is not None
-    for mine, theirs in zip(before.levels, after.levels, strict=True):
+    for mine, theirs in zip(before.layers[0], after.layers[0], strict=True):
         np.testing.assert_array_equal(mine, theirs)
     evaluated = evaluate_transmittance(after, data, selection)
     assert evaluated["held_out"]["mse"]["value"] == pytest.approx(0.25, rel=0.1)
@@ -147,9 +179,9 @@ def test_opposite_views_have_the_same_transmittance() -> None:
     """Nothing but the polynomial of the view's projection, at a texel's center, clamped."""
     lattice = Lattice(0)
     texel = np.array([0.5, 0.2, -0.1, -0.3, 0.4, 0.1], np.float32).reshape(1, 1, 6)
-    model = Transmittance(lattice, [texel])
+    model = Transmittance(lattice, (0.0,), [[texel]])
     omega = np.array([[0.6, -0.3, 0.74], [0.0, 0.0, 1.0]])
     x, y = omega[0, :2]
     wanted = 0.5 + 0.2 * x - 0.1 * y - 0.3 * x * x + 0.4 * x * y + 0.1 * y * y
     np.testing.assert_allclose(model.evaluate([[0.1, 0.9]] * 2, [0.3] * 2, omega), [wanted, 0.5], rtol=1e-6)
-    assert Transmittance(lattice, [8 * texel]).evaluate([[0.1, 0.9]], [0.3], omega[1:])[0] == 1.0
+    assert Transmittance(lattice, (0.0,), [[8 * texel]]).evaluate([[0.1, 0.9]], [0.3], omega[1:])[0] == 1.0

@@ -138,7 +138,7 @@ def test_holes_do_not_change_the_cone(tmp_path: Path, share: float) -> None:
     fitted = write_levels(tmp_path / "plane")
     texel = np.zeros((1, 1, 6), np.float32)
     texel[..., 0] = 1.0
-    hole = Transmittance(Lattice(0), [texel])
+    hole = Transmittance(Lattice(0), (0.0,), [[texel]])
     write_material(tmp_path / "sheet", finest=0, constant=(0.0,) * 3, transmittance=hole)
     camera = Camera(elevation=55.0, tiles_across=3.0, rows=6, columns=6)
     at = mi.ScalarTransform4f().translate([0, 0, share * float(camera.position[2])]).scale(300.0)

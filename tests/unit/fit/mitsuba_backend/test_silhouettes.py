@@ -265,7 +265,8 @@ def test_the_shadow_is_that_of_the_heights(tmp_path: Path) -> None:
 
 def holes(coefficient: float) -> Transmittance:
     """Holes that are seen differently from all sides."""
-    return Transmittance(Lattice(3), [np.full((2**k, 2**k, 6), coefficient, np.float32) for k in range(4)])
+    levels = [np.full((2**k, 2**k, 6), coefficient, np.float32) for k in range(4)]
+    return Transmittance(Lattice(3), (0.0,), [levels])
 
 
 @pytest.mark.parametrize("sampling", ["network", "cosine"])
