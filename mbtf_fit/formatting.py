@@ -93,8 +93,9 @@ def report_errors(
     if transmittance:
         through = next(iter(transmittance.values()))
         square, noise = (through[name]["value"] for name in ("mse", "noise"))
+        # The noise is at most that of independent paths.
         least, most = (max(0.0, x) ** 0.5 for x in (square - noise, square))
-        others.append(f"rms error of transmittance {least:.3f} ({most:.3f} with the noise of its estimates)")
+        others.append(f"rms error of transmittance between {least:.3f} and {most:.3f}")
     lines += [", ".join(others)] if others else []
     return [*lines, *_remarks(errors, foreign), *(_table_of(errors) if verbose else [])]
 

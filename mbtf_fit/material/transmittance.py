@@ -39,8 +39,9 @@ if TYPE_CHECKING:
 
 TRANSMITTANCE_NAME = "transmittance.safetensors"
 COEFFICIENTS = 6
-# Depths of the layers in the order of their fits, over that of the heights; of a surface without depth.
-_DEPTHS, _FLAT = (0.5, 0.25, 0.75), (0.0,)
+# Depths of the layers in the order of their fits, over that of the heights, below which so many of a hundred
+# lie: pits are none of holes; of a surface without depth.
+_DEPTHS, _HIGHER, _FLAT = (0.5, 0.25, 0.75), 5.0, (0.0,)
 # Smallest cosine of the view that divides depths.
 LEAST_COSINE = 0.05
 # For a reader of an export.
@@ -102,7 +103,8 @@ class Transmittance:
     layers: list[list[F32]]
 
     def evaluate(self, u: ArrayLike, sigma: ArrayLike, omega_o: ArrayLike) -> F32:
-        """Transmittance (n,) in [0, 1] at uv positions (n, 2), footprints (n,) and views (n, 3)."""
+        """Transmittance (n,) in [0, 1] at uv positions (n, 2), footprints (n,) and views (n, 3), equal for
+        opposite ones."""
         return np.clip(self.sum(u, sigma, omega_o), 0.0, 1.0).astype(np.float32)
 
     def sum(self, u: ArrayLike, sigma: ArrayLike, omega_o: ArrayLike) -> F64:
@@ -111,6 +113,8 @@ class Transmittance:
         level = np.clip(level_of_sigma(np.asarray(sigma, np.float64)), 0.0, finest)
         coarse = np.minimum(level.astype(np.int64), max(0, finest - 1))
         total = np.zeros(len(level))
+        omega_o = np.asarray(omega_o, np.float64)
+        omega_o = np.where(omega_o[:, 2:] < 0.0, -omega_o, omega_o)
         terms = basis(omega_o)
         for z, levels in zip(self.depths, self.layers, strict=True):
             at = crossings(u, omega_o, z, self.lattice.aspect)
@@ -165,15 +169,25 @@ def read_transmittance(folder: Path, description: Mapping[str, Any]) -> Transmit
     if stated is None:
         return None
     path = check_digest(folder / TRANSMITTANCE_NAME, stated)
-    lattice, layers = lattice_of(description), list[list[F32]]()
+    lattice = lattice_of(description)
     tensors, _ = read_tensors(path, "np")
-    depths = tensors.get("depths", np.zeros(0))
     shapes = [(*lattice.shape(s), COEFFICIENTS) for s in range(lattice.finest + 1)]
-    for k in range(len(depths)):
-        layers.append([tensors.get(f"{k}.{s}", np.zeros(0)) for s in range(len(shapes))])
-    found = [[a.shape if np.isfinite(a).all() else None for a in levels] for levels in layers]
-    if depths.ndim != 1 or not layers or any(levels != shapes for levels in found):
-        raise InputError("does not hold the levels that material.json describes", where=path)
+
+    def take(name: str, shape: tuple[int, ...] | None) -> F32:
+        found = tensors.get(name)
+        if (
+            found is None
+            or found.dtype != np.float32
+            or not np.isfinite(found).all()
+            or shape not in (None, found.shape)
+        ):
+            raise InputError(f"holds no '{name}' as material.json describes it", where=path)
+        return found
+
+    depths = take("depths", None)
+    if depths.ndim != 1 or not len(depths) or depths.max() > 0.0:
+        raise InputError("'depths' are not those of layers below the plane", where=path)
+    layers = [[take(f"{k}.{s}", shape) for s, shape in enumerate(shapes)] for k in range(len(depths))]
     return Transmittance(lattice, tuple(map(float, depths)), layers)
 
 
@@ -260,7 +274,7 @@ def fit_transmittance(data: Dataset, selection: Selection) -> Transmittance | No
     if not has_transmittance(data):
         return None
     lattice, geometry = data.lattice, data.geometry()
-    depth = 0.0 if geometry is None else -float(geometry.heights.min())
+    depth = 0.0 if geometry is None else -float(np.percentile(geometry.heights, _HIGHER))
     model = Transmittance(lattice, (), [])
     for part in _DEPTHS if depth > 0.0 else _FLAT:
         z = -float(np.float32(part * depth))

@@ -18,7 +18,7 @@ from mbtf_fit.evaluation import evaluate_splits
 from mbtf_fit.material.decoder import Decoder
 from mbtf_fit.material.format import DEFAULT_MIN_COS
 from mbtf_fit.material.material import export
-from mbtf_fit.material.transmittance import evaluate_transmittance, fit_transmittance
+from mbtf_fit.material.transmittance import evaluate_transmittance, fit_transmittance, has_transmittance
 from mbtf_fit.training.fit_folder import training_digest
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.sampler import distill
@@ -103,6 +103,8 @@ def export_fit(
         "noise_variance": noise,
         "noise_ratio": noise / variance if noise is not None and variance and variance > 0 else None,
     }
+    if has_transmittance(data):
+        announce("fitting the transmittance", 0.0, name)
     transmittance = fit_transmittance(data, partition.selection)
     if transmittance is not None:
         training["transmittance"] = evaluate_transmittance(transmittance, data, partition.selection)

@@ -7,6 +7,7 @@ from pathlib import Path
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.errors import InputError
+from mbtf_fit.material.transmittance import has_transmittance
 from mbtf_fit.models.registry import model_class
 
 
@@ -34,4 +35,7 @@ def open_data(folder: str | Path | DataFolder, model: str, cache: float | None =
             where=data.folder,
             hint=f"fit another model: --model {other}",
         )
+    if has_transmittance(data):
+        # Its layers need the depth: better refused here than after the training.
+        data.geometry()
     return data

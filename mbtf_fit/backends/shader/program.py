@@ -123,8 +123,9 @@ def _transmittance(material: Material, code: Code, level: str) -> list[str]:
     """Function of the transparent fraction of the footprint (mbtf_fit.material.transmittance)."""
     body = ["  return 0.0;"]
     if material.transmittance is not None:
-        cosine = f"max(omega_o.z, {number(LEAST_COSINE)})"
-        body = ["  float2 w = omega_o.xy, x;", "  float sum = 0.0;", "  float4 a, b;", "  Pair p;"]
+        cosine = f"max(abs(omega_o.z), {number(LEAST_COSINE)})"
+        body = ["  float2 w = omega_o.z < 0.0 ? -omega_o.xy : omega_o.xy, x;"]
+        body += ["  float sum = 0.0;", "  float4 a, b;", "  Pair p;"]
         for k, z in enumerate(material.transmittance.depths):
             image = code.image(f"{TRANSMITTANCE}.{k}")
             body += [

@@ -68,6 +68,8 @@ def test_the_plugin_evaluates_the_fitted_transmittance(tmp_path: Path) -> None:
     write_material(tmp_path, finest=3, aspect=2.0, transmittance=model)
     evaluator = Evaluator(read_material(tmp_path), "cooperative")
     q = random_queries(random, 3000, lattice)
+    grazing = 0.02 + 0.08 * random.random(300)
+    q["omega_o"][:300] = np.stack([np.sqrt(1 - grazing**2), 0 * grazing, grazing], -1)
     u, view = mi.Point2f(q["u"].T * 3 - 1), mi.Vector3f(q["omega_o"].T)
     level = evaluator.level(mi.Float(q["sigma"]))
     wanted = model.evaluate(q["u"] * 3 - 1, q["sigma"], q["omega_o"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,10 +14,13 @@ from support.image_data import write_images
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.shard_files import read_shard, write_shard
+from mbtf_core.errors import InputError
+from mbtf_core.files.atomic import file_sha256
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.streaming import Selection
 from mbtf_fit.evaluation import evaluate
+from mbtf_fit.formatting import report_errors
 from mbtf_fit.material.format import read_description
 from mbtf_fit.material.transmittance import (
     TRANSMITTANCE_NAME,
@@ -24,6 +28,7 @@ from mbtf_fit.material.transmittance import (
     evaluate_transmittance,
     fit_transmittance,
     read_transmittance,
+    write_transmittance,
 )
 from mbtf_fit.sections import HeldOutSection
 from mbtf_fit.training.fit import fit
@@ -62,7 +67,7 @@ def test_holes_are_found_at_their_depths(tmp_path: Path) -> None:
     lattice, aspect = Lattice(4, 0.5), 0.5
     surface = flat_geometry(lattice)
     heights = np.zeros_like(surface.heights)
-    heights[0, 0] = -0.2
+    heights[2:] = -0.2
     geometry = replace(surface, heights=heights)
 
     def sheets(u: np.ndarray, sigma: np.ndarray, omega_o: np.ndarray) -> np.ndarray:
@@ -166,6 +171,11 @@ def test_errors_include_the_noise_and_its_bound(tmp_path: Path) -> None:
     found = evaluate(result.material, folder)["transmittance"]
     assert stated == found
     assert list(found) == ["test", "held_out", "training"]
+    (line,) = (line for line in report_errors(result.errors, found, False) if "transmittance" in line)
+    least, most = map(float, re.findall(r"between ([\d.]+) and ([\d.]+)", line)[0])
+    # All of the error is noise.
+    assert least < 0.06
+    assert most == pytest.approx(found["test"]["mse"]["value"] ** 0.5, abs=1e-3)
     for error in found.values():
         noise = error["noise"]["value"]
         assert noise == pytest.approx(0.3 * 0.7 / 4, rel=0.08)
@@ -175,7 +185,60 @@ def test_errors_include_the_noise_and_its_bound(tmp_path: Path) -> None:
         assert error["variance"] == pytest.approx(noise, rel=few)
 
 
-def test_opposite_views_have_the_same_transmittance() -> None:
+def test_views_from_below_and_along_the_normal() -> None:
+    """Layers are read where a line crosses them, from either end; grazing ones at a cosine of 0.05."""
+    random, lattice = np.random.default_rng(4), Lattice(1, 2.0)
+    layers = [
+        [random.normal(0.2, 0.1, (*lattice.shape(s), 6)).astype(np.float32) for s in (0, 1)] for _ in "ab"
+    ]
+    model = Transmittance(lattice, (-0.1, -0.3), layers)
+    u, sigma = random.random((50, 2)), np.full(50, 0.25)
+    omega = random.normal(size=(50, 3))
+    omega /= np.linalg.norm(omega, axis=1, keepdims=True)
+    np.testing.assert_array_equal(model.evaluate(u, sigma, omega), model.evaluate(u, sigma, -omega))
+    up = np.tile([0.0, 0.0, 1.0], (50, 1))
+    rows, columns = lattice.shape(1)
+    texel = np.array([(i, j) for j in range(rows) for i in range(columns)])
+    center = (texel + 0.5) / (columns, rows) * (1, -1) + (0, 1)
+    found = model.evaluate(center, sigma[: len(center)], up[: len(center)]).reshape(rows, columns)
+    np.testing.assert_allclose(model.from_above(1), found, rtol=1e-6)
+    grazing, steep = np.array([[0.9998, 0.0, 0.02], [0.9998, 0.0, 0.05]])
+    both = [model.evaluate(u[:1], sigma[:1], omega[None])[0] for omega in (grazing, steep)]
+    assert both[0] == pytest.approx(both[1], rel=1e-6)
+
+
+def test_damaged_layers_are_refused(tmp_path: Path) -> None:
+    from safetensors.numpy import load_file, save_file
+
+    lattice = Lattice(1)
+    layers = [[np.full((*lattice.shape(s), 6), k + s, np.float32) for s in (0, 1)] for k in range(3)]
+    path, description = tmp_path / TRANSMITTANCE_NAME, {"levels": {"finest": 1}, "tile": {"aspect": 1.0}}
+    write_transmittance(Transmittance(lattice, (-0.1, -0.2, -0.3), layers), path)
+    tensors = load_file(path)
+
+    def read(changed: dict[str, np.ndarray]) -> Transmittance | None:
+        save_file({**tensors, **changed}, path)
+        stated = {"file": path.name, "sha256": file_sha256(path)}
+        return read_transmittance(tmp_path, {**description, "transmittance": stated})
+
+    again = read({})
+    assert again is not None
+    assert [[a[0, 0, 0] for a in levels] for levels in again.layers] == [[0, 1], [1, 2], [2, 3]]
+    for changed in (
+        {"depths": np.array(0.0, np.float32)},
+        {"depths": np.zeros(0, np.float32)},
+        {"depths": np.array([np.nan] * 3, np.float32)},
+        {"depths": np.array([0.1, 0.0, 0.0], np.float32)},
+        {"depths": np.zeros(3, np.int64)},
+        {"depths": np.zeros(4, np.float32)},
+        {"1.1": np.zeros((2, 2, 6), np.complex64)},
+        {"2.0": np.zeros((1, 1, 5), np.float32)},
+    ):
+        with pytest.raises(InputError, match=TRANSMITTANCE_NAME):
+            read(changed)
+
+
+def test_values_are_those_of_the_polynomial() -> None:
     """Nothing but the polynomial of the view's projection, at a texel's center, clamped."""
     lattice = Lattice(0)
     texel = np.array([0.5, 0.2, -0.1, -0.3, 0.4, 0.1], np.float32).reshape(1, 1, 6)
