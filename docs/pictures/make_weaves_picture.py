@@ -2,23 +2,28 @@
 
 Two commands make each fit: ``mbtf-gen material.yaml --quality draft --lights-per-path 4 -o shards`` and
 ``mbtf-fit shards --quality draft``.
-Finished folders are kept in out/weaves. From the repository's root, in half an hour: ``.venv/bin/python
+Finished folders are kept in out/weaves. Prints errors, and contrasts of the fits (luminance Y, R - Y, B - Y)
+over those of the references. From the repository's root, in half an hour: ``.venv/bin/python
 docs/pictures/make_weaves_picture.py``.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from make_contact_sheet import GAP, PAPER, ROOT, sheet
+from numpy.typing import NDArray
 from PIL import Image
 
 from mbtf_core.color import to_display
 from mbtf_core.data.shard_files import read_exr
+from mbtf_core.images.read import LUMINANCE
 from mbtf_core.pictures import read_value
 from mbtf_fit import Material
 
@@ -41,9 +46,11 @@ TILES = 3
 # With fewer paths, the noise of the reference looks like fibers.
 PICTURE = f"--view 55,-90 --light 35,140 --tiles-across {TILES} --size 144 --spp 400".split()
 DRAFT = ("--quality", "draft")
-QUERIES = ("u", "sigma", "omega_i", "omega_o")
+QUERIES = {"u": 2, "sigma": 1, "omega_i": 3, "omega_o": 3}
 EXPOSURE = 1.65
 ACROSS = 2
+
+F32 = NDArray[np.float32]
 
 
 def material(title: str, start: str) -> str:
@@ -60,17 +67,32 @@ def run(program: str, *words: str) -> Any:
     return json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)
 
 
+def contrasts(fit: F32, a: F32, b: F32) -> list[float]:
+    """Standard deviations of a fit over those of its reference without noise; `a` and `b` are its halves."""
+
+    def parts(value: F32) -> list[F32]:
+        y = value @ np.array(LUMINANCE, np.float32)
+        return [y, value[..., 0] - y, value[..., 2] - y]
+
+    return [
+        round(math.sqrt(x.var() / np.cov(y.ravel(), z.ravel())[0, 1]), 3)
+        for x, y, z in zip(parts(fit), parts(a), parts(b), strict=True)
+    ]
+
+
 def pair(folder: Path) -> tuple[dict[str, float], Image.Image]:
     """Unexplained variance of the picture; reference and fit side by side."""
     shards, fit, compared = (str(folder / name) for name in ("shards", "fit", "compared"))
     run("mbtf-gen", str(folder / "material.yaml"), *DRAFT, "--lights-per-path", "4", "-o", shards)
     run("mbtf-fit", shards, *DRAFT, "-o", fit)
     (errors,) = run("mbtf-fit", "compare", fit, shards, *PICTURE, "-o", compared)["pictures"]
-    print(errors, flush=True)
     path = folder / "compared" / f"query-tiles{TILES}.exr"
-    reference, queries = read_value(path), read_exr(path, QUERIES)
-    flat = [queries[name].reshape(-1, *queries[name].shape[2:]) for name in QUERIES]
-    found = Material.load(fit).evaluate(*flat).reshape(reference.shape)
+    reference, stored = read_value(path), read_exr(path, (*QUERIES, "value_a", "value_b"))
+    u, sigma, *directions = (stored[name].reshape(-1, size) for name, size in QUERIES.items())
+    found = Material.load(fit).evaluate(u, sigma[:, 0], *directions).reshape(reference.shape)
+    print(
+        errors, contrasts(found, *(stored[name].reshape(reference.shape) for name in ("value_a", "value_b")))
+    )
     rows, columns = reference.shape[:2]
     out = Image.new("RGB", (2 * columns + GAP, rows), PAPER)
     for number, value in enumerate((reference, found)):
