@@ -24,7 +24,6 @@ from PIL import Image
 from mbtf_core.color import to_display
 from mbtf_core.data.shard_files import read_exr
 from mbtf_core.images.read import LUMINANCE
-from mbtf_core.pictures import read_value
 from mbtf_fit import Material
 
 # Title and first lines of each material file.
@@ -86,16 +85,14 @@ def pair(folder: Path) -> tuple[dict[str, float], Image.Image]:
     run("mbtf-gen", str(folder / "material.yaml"), *DRAFT, "--lights-per-path", "4", "-o", shards)
     run("mbtf-fit", shards, *DRAFT, "-o", fit)
     (errors,) = run("mbtf-fit", "compare", fit, shards, *PICTURE, "-o", compared)["pictures"]
-    path = folder / "compared" / f"query-tiles{TILES}.exr"
-    reference, stored = read_value(path), read_exr(path, (*QUERIES, "value_a", "value_b"))
+    stored = read_exr(folder / "compared" / f"query-tiles{TILES}.exr", (*QUERIES, "value_a", "value_b"))
     u, sigma, *directions = (stored[name].reshape(-1, size) for name, size in QUERIES.items())
-    found = Material.load(fit).evaluate(u, sigma[:, 0], *directions).reshape(reference.shape)
-    print(
-        errors, contrasts(found, *(stored[name].reshape(reference.shape) for name in ("value_a", "value_b")))
-    )
-    rows, columns = reference.shape[:2]
+    found = Material.load(fit).evaluate(u, sigma[:, 0], *directions)
+    rows, columns = stored["value_a"].shape[-3:-1]
+    found, a, b = (x.reshape(rows, columns, 3) for x in (found, stored["value_a"], stored["value_b"]))
+    print(errors, contrasts(found, a, b))
     out = Image.new("RGB", (2 * columns + GAP, rows), PAPER)
-    for number, value in enumerate((reference, found)):
+    for number, value in enumerate((0.5 * (a + b), found)):
         out.paste(Image.fromarray(to_display(value, EXPOSURE)), (number * (columns + GAP), 0))
     return errors["unexplained"], out
 

@@ -44,7 +44,7 @@ from mbtf_fit.maps.reference_values import (
     steep_views,
 )
 from mbtf_fit.material.material import Material
-from mbtf_fit.objective.parallel import one_thread_each
+from mbtf_fit.threads import one_thread_each
 
 F64 = NDArray[np.float64]
 # F0 of a dielectric of refractive index 1.5.

@@ -39,9 +39,10 @@ if TYPE_CHECKING:
 
 TRANSMITTANCE_NAME = "transmittance.safetensors"
 COEFFICIENTS = 6
-# Depths of the layers in the order of their fits, over that of the heights, below which so many of a hundred
-# lie: pits are none of holes; of a surface without depth.
-_DEPTHS, _HIGHER, _FLAT = (0.5, 0.25, 0.75), 5.0, (0.0,)
+# Depths of the layers, in the order of their fits, over the depth of the surface; of a surface without depth.
+_DEPTHS, _FLAT = (0.5, 0.25, 0.75), (0.0,)
+# Percentile of the heights that is the depth of the surface: lone pits do not count.
+_LOWEST = 5.0
 # Smallest cosine of the view that divides depths.
 LEAST_COSINE = 0.05
 # For a reader of an export.
@@ -173,21 +174,18 @@ def read_transmittance(folder: Path, description: Mapping[str, Any]) -> Transmit
     tensors, _ = read_tensors(path, "np")
     shapes = [(*lattice.shape(s), COEFFICIENTS) for s in range(lattice.finest + 1)]
 
-    def take(name: str, shape: tuple[int, ...] | None) -> F32:
+    def take(name: str) -> F32:
         found = tensors.get(name)
-        if (
-            found is None
-            or found.dtype != np.float32
-            or not np.isfinite(found).all()
-            or shape not in (None, found.shape)
-        ):
-            raise InputError(f"holds no '{name}' as material.json describes it", where=path)
+        if found is None or found.dtype != np.float32 or not np.isfinite(found).all():
+            raise InputError(f"holds no finite 32-bit floats '{name}'", where=path)
         return found
 
-    depths = take("depths", None)
+    depths = take("depths")
     if depths.ndim != 1 or not len(depths) or depths.max() > 0.0:
         raise InputError("'depths' are not those of layers below the plane", where=path)
-    layers = [[take(f"{k}.{s}", shape) for s, shape in enumerate(shapes)] for k in range(len(depths))]
+    layers = [[take(f"{k}.{s}") for s in range(len(shapes))] for k in range(len(depths))]
+    if any([a.shape for a in levels] != shapes for levels in layers):
+        raise InputError("does not hold the levels that material.json describes", where=path)
     return Transmittance(lattice, tuple(map(float, depths)), layers)
 
 
@@ -274,7 +272,7 @@ def fit_transmittance(data: Dataset, selection: Selection) -> Transmittance | No
     if not has_transmittance(data):
         return None
     lattice, geometry = data.lattice, data.geometry()
-    depth = 0.0 if geometry is None else -float(np.percentile(geometry.heights, _HIGHER))
+    depth = 0.0 if geometry is None else -float(np.percentile(geometry.heights, _LOWEST))
     model = Transmittance(lattice, (), [])
     for part in _DEPTHS if depth > 0.0 else _FLAT:
         z = -float(np.float32(part * depth))

@@ -7,9 +7,8 @@ runs single-threaded operations in parallel.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any, TypeVar
 
@@ -28,17 +27,6 @@ T = TypeVar("T")
 
 Batch = TrainingQueries | Patches | SliceBatch
 Loss = Callable[[Any], Tensor]
-
-
-@contextmanager
-def one_thread_each() -> Iterator[None]:
-    """PyTorch with one thread per operation, as small ones lose time waiting."""
-    count = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(count)
 
 
 class Workers:

@@ -22,6 +22,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mbtf_fit.threads import one_thread_each
+
 # Steps of the fit; standard deviations of a footprint that its window has on each side; samples per standard
 # deviation, at least, where texels are finer.
 _STEPS, _REACH, _DENSITY = 10, 2.5, 24.0
@@ -68,15 +70,8 @@ def slope_distributions(
         found = _fit(sample[at].reshape(-1, count, 2), within[at].reshape(-1, count, 3), weight)
         out[part] = found.reshape(-1, shape[1], 5)
 
-    threads = torch.get_num_threads()
-    # Each thread takes whole rows: operations that share their work would wait for every core that another
-    # process uses.
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(fit_rows, range(0, shape[0], rows)))
-    finally:
-        torch.set_num_threads(threads)
+    with one_thread_each() as threads, ThreadPoolExecutor(threads) as pool:
+        list(pool.map(fit_rows, range(0, shape[0], rows)))
     return out
 
 

@@ -25,12 +25,12 @@ from mbtf_core.directions import from_projected_disk
 from mbtf_fit import ops
 from mbtf_fit.material.inference import predict
 from mbtf_fit.material.sampler import Sampler
-from mbtf_fit.objective.parallel import one_thread_each
 from mbtf_fit.ops.operation import SAMPLER
 from mbtf_fit.ops.sampler import LARGEST_LOG, LARGEST_WEIGHT, LEAST_ALPHA, sampler_of
 from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.pytorch.networks import Mlp, initialize_layers
 from mbtf_fit.pytorch.values import read_values
+from mbtf_fit.threads import one_thread_each
 
 # Most queries of a round, and lights of each; a fit has fewer where it was shorter.
 QUERIES, LIGHTS = 1 << 13, 32

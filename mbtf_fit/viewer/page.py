@@ -124,15 +124,15 @@ def _moments(layout: Layout, texels: F32) -> list[tuple[F32, F32, bool]]:
 def pack_textures(material: Material, bits: int = 8) -> dict[str, PackedTexture]:
     """All textures by name, with so many bits per number; heights have 12, the transmittance at most 6: it is
     not exact."""
-    images = program_of(material, GLSL).images
-    most = {image.source: 6 for image in images if image.source.startswith(TRANSMITTANCE)}
+
+    def bits_of(image: TexelImage) -> int:
+        if image.layout == "nodes":
+            return 12
+        return min(bits, 6) if image.source.startswith(TRANSMITTANCE) else bits
+
     return {
-        image.source: pack(
-            _rounded(image),
-            12 if image.layout == "nodes" else min(bits, most.get(image.source, bits)),
-            alike=image.layout == "horizons",
-        )
-        for image in images
+        image.source: pack(_rounded(image), bits_of(image), alike=image.layout == "horizons")
+        for image in program_of(material, GLSL).images
         if image.layout != "rows"
     }
 

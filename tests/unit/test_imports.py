@@ -23,9 +23,9 @@ ROOMS = {
     "mbtf_core": ". config files run app images meshes data stats pictures",
     "mbtf_gen": "sampling measured engine config tile.tracers tile.heights tile.fibers tile.maps tile render"
     " checks doctor,selftest job planning forecast generation pictures publishing cli .",
-    "mbtf_fit": "sections formatting ops data native surface pytorch objective backends.cpu models config"
-    " material maps evaluation"
-    " training backends.mitsuba backends.shader preview comparison viewer export cli .",
+    "mbtf_fit": "sections formatting threads ops data native surface pytorch objective backends.cpu models"
+    " config material maps evaluation training backends.mitsuba backends.shader preview comparison"
+    " viewer export cli .",
     "mbtf_pipeline": "recipe compare stages tables report run collection cost cli .",
 }
 RANK = {
