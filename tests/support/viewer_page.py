@@ -45,9 +45,9 @@ class Page:
         return found
 
     def ready(self) -> Page:
-        """Wait for the first picture."""
+        """Wait for the first picture. Messages of what is under way end in an ellipsis, faults do not."""
         message = "document.getElementById('message').textContent"
-        self.until(lambda: self.js(f"return window.mbtf !== undefined || !/^Loading|^$/.test({message})"))
+        self.until(lambda: self.js(f"return window.mbtf !== undefined || !/…$|^$/.test({message})"))
         assert self.js("return window.mbtf !== undefined"), self.message()
         return self
 
