@@ -45,8 +45,9 @@ def ball() -> None:
     mbtf_fit.backends.mitsuba.register("llvm_ad_rgb")
     import mitsuba as mi
 
+    source, material = ROOT / "examples/ball.xml", ROOT / TURTLE_SHELL
     scene = mbtf_fit.backends.mitsuba.load_scene(
-        str(ROOT / "examples/ball.xml"), material=str(ROOT / TURTLE_SHELL), size=SIZE, spp=SPP
+        str(source), material=str(material), silhouettes=True, size=SIZE, spp=SPP
     )
     path = ROOT / WORK / "ball.png"
     path.parent.mkdir(parents=True, exist_ok=True)
