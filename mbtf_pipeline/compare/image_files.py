@@ -54,7 +54,7 @@ def scenes(compare: CompareSection) -> Iterator[Scene]:
     """All scenes of a comparison: views outermost, widths innermost. Only their number is right where the
     widths are those of the data."""
     widths = compare.tiles_across or PIXEL_TEXELS
-    numbered = product(*(enumerate(of, 1) for of in (compare.views, compare.lights, widths)))
+    numbered = product(enumerate(compare.views, 1), enumerate(compare.lights, 1), enumerate(widths, 1))
     for index, ((v, view), (n, light), (s, tiles_across)) in enumerate(numbered):
         yield Scene(index, f"v{v}-l{n}-s{s}", view, light, tiles_across)
 
