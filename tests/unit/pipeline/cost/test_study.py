@@ -67,6 +67,8 @@ def test_a_run_that_fails_does_not_stop_the_others(monkeypatch: pytest.MonkeyPat
     found.measure_runs(planned, lambda run: True)
     assert found.failed == {runs[2].label: "training diverged at step 7"}
     assert [len(found.group(run)) for run in runs] == [2, 2, 0]
+    # Training, and what the others have taken besides, at most.
+    assert found.expected_seconds(runs[1]) == 24.0
 
 
 RUNS = [run(3000, "long", 7200.0), run(2000, "short", 60.0), run(1000, "m", 40.0)]
