@@ -169,9 +169,6 @@ def _option(flag: Flag, key: str, field: FieldInfo) -> ConfigOption:
         metavar=flag.metavar or (None if choices else _METAVARS.get(kind, "TEXT")),
         help=f"{text[:1].upper()}{text[1:]}.",
         show_default=default or _default_text(field) or False,
-        # The first of several numbers may be negative.
-        allow_leading_hyphen=typing.get_origin(kind) is list
-        or (isinstance(kind, type) and issubclass(kind, BaseModel)),
     )
     group = [Parameter(group=MORE)] if flag.rare else []
     return ConfigOption(key, flag.name, Annotated[(kind if choices else str) | None, shown, *group])
