@@ -135,11 +135,6 @@ def tick_labels(low: float, high: float, factor: float = 1.0) -> list[str]:
     return [f"{factor * x:.3g}".replace("-", "−") for x in np.linspace(low, high, 5)]
 
 
-def common_scale(maps: Sequence[ArrayLike]) -> float:
-    """Rounded end of the scale of several maps: the 99th percentile of all magnitudes."""
-    return round_scale(_extent(maps))
-
-
 def robust_scale(groups: Sequence[Sequence[ArrayLike]]) -> float:
     """Rounded end of the common scale of several groups of maps, such as those of each fit: the 99th
     percentile of the magnitudes of a group, and the largest over the groups that do not exceed four times the

@@ -174,24 +174,20 @@ class ReferenceImage:
 
     Attributes
     ----------
-    kind : {"query", "pixel"}
-        Meaning of a pixel, see the module.
-    camera : the camera
-    queries : one per pixel, with leading axes (rows, columns)
     value_a, value_b : (rows, columns, 3) float32 array
         Independent halves, in 1/sr.
     spp : paths per pixel, both halves together
     transmittance : (rows, columns) float32 array or None
-        Fraction of the view rays that the opacity mask transmits; None without a mask.
+        Fraction of the view rays that the opacity mask transmits, or that miss a displaced shape; None where
+        there is neither.
+    queries : one per pixel, with leading axes (rows, columns); None for a displaced shape
     """
 
-    kind: PixelKind
-    camera: Camera
-    queries: Queries
     value_a: NDArray[np.float32]
     value_b: NDArray[np.float32]
     spp: int
     transmittance: NDArray[np.float32] | None = None
+    queries: Queries | None = None
 
     @property
     def value(self) -> NDArray[np.float32]:
@@ -200,12 +196,13 @@ class ReferenceImage:
 
     def write(self, path: Path) -> Path:
         """Write ``path`` + ``.exr`` with all channels, atomically, and return its path."""
-        spp = np.full(self.queries.lead, self.spp, np.float32)
-        arrays = {**vars(self.queries), "value_a": self.value_a, "value_b": self.value_b, "spp": spp}
-        if self.transmittance is not None:
-            arrays["transmittance"] = self.transmittance
+        spp = np.full(self.value_a.shape[:2], self.spp, np.float32)
+        arrays = {"value_a": self.value_a, "value_b": self.value_b, "spp": spp}
+        arrays |= {} if self.queries is None else vars(self.queries)
+        arrays |= {} if self.transmittance is None else {"transmittance": self.transmittance}
         exr = path.with_name(f"{path.name}.exr")
-        write_exr(exr, {name: array[None] for name, array in arrays.items()})
+        found = {name: array[None] for name, array in arrays.items()}
+        write_exr(exr, found, complete=self.queries is not None)
         return exr
 
 

@@ -50,9 +50,8 @@ def exposure_of(queries: ShardQueries) -> float:
 
 def split_errors(
     predict: Predict, queries: ShardQueries, data: Dataset, exposure: float | None = None
-) -> dict[str, Any] | None:
-    """Errors of a prediction on queries of a data set, without the noise of the data; None where there are no
-    queries.
+) -> dict[str, Any]:
+    """Errors of a prediction on queries of a data set, without the noise of the data.
 
     Parameters
     ----------
@@ -73,8 +72,6 @@ def split_errors(
         value that the exposure shows as white; ``visibility``: in words; ``includes_noise``: whether the data
         have one value per query.
     """
-    if len(queries) == 0:
-        return None
     exposure = exposure_of(queries) if exposure is None else exposure
     arrays = predict(queries), *queries.halves
     mse = noise_free_mse(*arrays)
@@ -181,10 +178,8 @@ def evaluate_splits(
     found, done, total = dict[str, dict[str, Any]](), 0, sum(map(len, parts.values()))
     for name, queries in parts.items():
         progress(done / total)
-        errors = split_errors(predict, queries, data, exposure)
+        found[name] = split_errors(predict, queries, data, exposure)
         done += len(queries)
-        if errors is not None:
-            found[name] = errors
     return found
 
 
@@ -281,9 +276,7 @@ def score_predictions(file: str | Path, shards: str | Path | DataFolder) -> dict
         raise InputError(
             f"'value' is NaN or infinite at {len(bad)} queries, first at query {bad[0]}", where=file
         )
-    errors = split_errors(lambda _: value.reshape(-1, 3), queries, data)
-    assert errors is not None
-    return {"errors": {"test": errors}}
+    return {"errors": {"test": split_errors(lambda _: value.reshape(-1, 3), queries, data)}}
 
 
 # What NumPy raises of files that are damaged, encrypted or something else.

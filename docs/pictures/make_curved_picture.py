@@ -169,9 +169,9 @@ def main() -> None:
             line = compared(found, expected, (shadow, beneath))
             print(f"{name}, {shape}, {'with' if silhouettes else 'without'} silhouettes: {line}", flush=True)
         # Without the empty space above and below.
-        full = np.flatnonzero((expected.transmittance < 0.5).any(1))
+        full = np.flatnonzero((np.asarray(expected.transmittance) < 0.5).any(1))
         cut = slice(max(0, full[0] - 6), full[-1] + 7)
-        white = [p.value + p.transmittance[..., None] for p in pictures]
+        white = [p.value + np.asarray(p.transmittance)[..., None] for p in pictures]
         rows.append(np.concatenate([picture[cut] for picture in white], 1))
     if not table:
         picture = to_display(np.concatenate(rows), EXPOSURE)

@@ -24,7 +24,7 @@ import os
 import shlex
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, make_dataclass, replace
+from dataclasses import dataclass, make_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, Literal, TypeVar, Union
 
@@ -137,55 +137,17 @@ class Flag:
 
 @dataclass(frozen=True)
 class ConfigOption:
-    """One option of a configuration.
+    """One option of a configuration: its dotted key, such as ``queries.train``, its flag, and the type of its
+    Python parameter with what the help shows."""
 
-    Attributes
-    ----------
-    flag : such as ``--queries``
-    key : dotted, such as ``queries.train``
-    type : the choices as a Literal, or str
-    metavar : what the help shows for its value; None for choices
-    default : as one would write it; empty if there is none
-    help : one sentence
-    is_list : whether its value is several numbers, of which the first may be negative
-    rare : see :class:`Flag`
-    """
-
-    flag: str
     key: str
-    type: Any
-    metavar: str | None
-    default: str
-    help: str
-    is_list: bool
-    rare: bool
+    flag: str
+    annotation: Any
 
     @property
     def parameter(self) -> str:
         """Name of the Python parameter."""
         return self.flag.lstrip("-").replace("-", "_")
-
-    @property
-    def annotation(self) -> Any:
-        """Type of the Python parameter, with what the help shows."""
-        shown = Parameter(
-            name=self.flag,
-            metavar=self.metavar,
-            help=self.help,
-            show_default=self.default or False,
-            allow_leading_hyphen=self.is_list,
-        )
-        group = [Parameter(group=MORE)] if self.rare else []
-        return Annotated[self.type | None, shown, *group]
-
-
-def config_options(model: type[BaseModel], *keys: str) -> list[ConfigOption]:
-    """Options of a configuration in its own order: those of dotted keys, of options or of whole sections; all
-    by default."""
-    found = list(_walk(model, ""))
-    if not keys:
-        return found
-    return [o for o in found if any(f"{o.key}.".startswith(f"{key}.") for key in keys)]
 
 
 def _walk(model: type[BaseModel], prefix: str) -> Iterator[ConfigOption]:
@@ -202,16 +164,14 @@ def _option(flag: Flag, key: str, field: FieldInfo) -> ConfigOption:
     parts = [part for part in parts_of(field.annotation, containers=False) if part is not type(None)]
     kind: Any = parts[0] if len(parts) == 1 else Union[tuple(parts)]  # noqa: UP007
     choices = any(typing.get_origin(part) is Literal for part in parts) and flag.metavar is None
-    return ConfigOption(
-        flag.name,
-        key,
-        kind if choices else str,
-        flag.metavar or (None if choices else _METAVARS.get(kind, "TEXT")),
-        default or _default_text(field),
-        f"{text[:1].upper()}{text[1:]}.",
-        typing.get_origin(kind) is list or (isinstance(kind, type) and issubclass(kind, BaseModel)),
-        flag.rare,
+    shown = Parameter(
+        name=flag.name,
+        metavar=flag.metavar or (None if choices else _METAVARS.get(kind, "TEXT")),
+        help=f"{text[:1].upper()}{text[1:]}.",
+        show_default=default or _default_text(field) or False,
     )
+    group = [Parameter(group=MORE)] if flag.rare else []
+    return ConfigOption(key, flag.name, Annotated[(kind if choices else str) | None, shown, *group])
 
 
 def _default_text(field: FieldInfo) -> str:
@@ -261,10 +221,6 @@ class Options(Generic[S]):
         flags = [f"{key}={value}" for key, value in self.given.items()]
         return explicit_options(self.config, [*(self.assignments or ()), *flags])
 
-    def assigning(self: C, assignment: str) -> C:
-        """The same command line with one more ``a.b=c``."""
-        return replace(self, assignments=[*(self.assignments or ()), assignment])  # type: ignore[type-var]
-
     def resolve(self, presets: Mapping[str, Any] | None = None, **arguments: Any) -> S:
         """The configuration: defaults, file, presets, assignments, flags; errors are those of
         :func:`resolve`.
@@ -299,7 +255,7 @@ def options_from(model: type[BaseModel], *keys: str) -> Callable[[type[C]], type
     """Decorator of a class of :class:`Options`: gives it a field per option of a configuration, by the dotted
     keys of options or sections or of all, and ``--config`` and ``--set``; a ValueError if two have the same
     flag."""
-    table = config_options(model, *keys)
+    table = [o for o in _walk(model, "") if not keys or any(f"{o.key}.".startswith(f"{k}.") for k in keys)]
     if len({o.flag for o in table}) < len(table):
         raise ValueError(f"two options of {model.__name__} have the same flag: choose one of their keys")
     own: list[tuple[str, Any, None]] = [(o.parameter, o.annotation, None) for o in table]

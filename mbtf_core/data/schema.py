@@ -102,11 +102,6 @@ class ArraySpec:
     channels: tuple[str, ...]
     optional: bool = False
 
-    @property
-    def dtype(self) -> np.dtype[np.float32]:
-        """Little-endian float32, all of them."""
-        return np.dtype("<f4")
-
 
 def _array(name: str, channels: str, unit: str, meaning: str, optional: bool = False) -> ArraySpec:
     suffixes = channels.split()

@@ -154,7 +154,7 @@ def _npz_chunks(arrays: Iterable[tuple[str, NDArray[np.float32]]]) -> Iterator[b
 def write_npz(path: Path, arrays: Mapping[str, NDArray[np.float32]]) -> Stored:
     """Write a shard as npz, atomically; the bytes depend on the arrays alone."""
     check_arrays(arrays, path)
-    present = ((s.name, np.ascontiguousarray(arrays[s.name], s.dtype)) for s in ARRAYS if s.name in arrays)
+    present = ((s.name, np.ascontiguousarray(arrays[s.name], "<f4")) for s in ARRAYS if s.name in arrays)
     return write_chunks(path, _npz_chunks(present))
 
 

@@ -95,18 +95,11 @@ class DaskRunner(Runner):
         self._watch.start()
 
     def _look(self) -> None:
-        found = call_within(self._config.timeout, self._listed)
-        self.workers = len(found)
-        self._gpus = any("GPU" in worker["resources"] for worker in found.values())
-
-    def _listed(self) -> dict[str, Any]:
-        """All workers."""
-        try:
-            found: dict[str, Any] = self._client.scheduler_info(n_workers=-1)["workers"]
-        except TypeError:
-            # Older versions know no other answer.
-            found = self._client.scheduler_info()["workers"]
-        return found
+        scheduler = call_within(
+            self._config.timeout, lambda: self._client.sync(self._client.scheduler.identity)
+        )
+        self.workers = len(scheduler["workers"])
+        self._gpus = any("GPU" in worker["resources"] for worker in scheduler["workers"].values())
 
     def _observe(self) -> None:
         """Keep the number of workers; says when none is left."""

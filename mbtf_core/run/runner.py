@@ -53,11 +53,11 @@ class Runner:
         PartialError : the workers cannot be reached any more
         """
         waiting = iter(items)
-        with contextlib.closing(_Overlap(function)) as overlap:
-            while True:
-                progress = False
-                locked: list[tuple[Item, Result]] = []
-                for item, value in overlap.run(waiting):
+        while True:
+            progress = False
+            locked: list[tuple[Item, Result]] = []
+            with contextlib.closing(_overlapped(function, waiting)) as ended:
+                for item, value in ended:
                     if not isinstance(value, MbtfError):
                         result = Result(item.name, value)
                     elif (found := failure(value))["fatal"] and not independent:
@@ -69,50 +69,37 @@ class Runner:
                         continue
                     progress = True
                     yield result
-                if not progress:
-                    break
-                # Another process may have finished some by now.
-                waiting = iter([item for item, _ in locked])
+            if not progress:
+                break
+            # Another process may have finished some by now.
+            waiting = iter([item for item, _ in locked])
         for _, result in locked:
             yield result
 
 
-class _Overlap:
-    """Calls a function for items in this process. The first and last part of a generator run in threads, one
-    item ahead and one behind."""
-
-    def __init__(self, function: TaskFunction) -> None:
-        self._function = function
-        self._before = ThreadPoolExecutor(1, "ahead")
-        self._after = ThreadPoolExecutor(1, "behind")
-        self._open: list[Generator[None, None, Any]] = []
-
-    def close(self) -> None:
-        """Wait for the threads, which finish what they do, and close the other items."""
-        for pool in (self._before, self._after):
-            pool.shutdown(cancel_futures=pool is self._before)
-        for parts in self._open:
-            parts.close()
-
-    def run(self, items: Iterator[Item]) -> Iterator[tuple[Item, Any]]:
-        """Items and their values or errors, in the order in which they end."""
-        begun: deque[tuple[Item, Any, Future[Any]]] = deque()
-        ending: deque[tuple[Item, Any, Future[Any]]] = deque()
+def _overlapped(function: TaskFunction, items: Iterator[Item]) -> Generator[tuple[Item, Any]]:
+    """Items and the values or errors of a function, in the order in which they end. The first and last part
+    of a generator run in threads, one item ahead and one behind."""
+    ahead, behind = ThreadPoolExecutor(1, "ahead"), ThreadPoolExecutor(1, "behind")
+    opened: list[Generator[None, None, Any]] = []
+    begun: deque[tuple[Item, Any, Future[Any]]] = deque()
+    ending: deque[tuple[Item, Any, Future[Any]]] = deque()
+    try:
         while True:
             while len(begun) < 2 and (item := next(items, None)) is not None:
-                if not inspect.isgeneratorfunction(self._function):
-                    yield item, _tried(self._function, **item.arguments)
+                if not inspect.isgeneratorfunction(function):
+                    yield item, _tried(function, **item.arguments)
                     continue
-                parts = self._function(**item.arguments)
-                self._open.append(parts)
-                begun.append((item, parts, self._before.submit(_part, parts)))
+                parts = function(**item.arguments)
+                opened.append(parts)
+                begun.append((item, parts, ahead.submit(_part, parts)))
             if not begun and not ending:
                 return
             # One is behind at most: more would take memory.
             while ending and (not begun or len(ending) > 1 or ending[0][2].done()):
                 item, parts, last = ending.popleft()
                 _, value = last.result()
-                self._open.remove(parts)
+                opened.remove(parts)
                 yield item, value
             if not begun:
                 continue
@@ -121,10 +108,16 @@ class _Overlap:
             if not done:
                 done, value = _part(parts)
             if done:
-                self._open.remove(parts)
+                opened.remove(parts)
                 yield item, value
             else:
-                ending.append((item, parts, self._after.submit(_part, parts)))
+                ending.append((item, parts, behind.submit(_part, parts)))
+    finally:
+        # The threads finish what they do.
+        ahead.shutdown(cancel_futures=True)
+        behind.shutdown()
+        for parts in opened:
+            parts.close()
 
 
 def _tried(function: Callable[..., Any], **arguments: Any) -> Any:

@@ -112,7 +112,7 @@ def mean_estimate(
     if weights is None and groups is None:
         error = float(units.std(ddof=1)) / math.sqrt(n) if n > 1 else math.inf
         return Estimate(float(units.mean()), error, n)
-    w = np.ones(n) if weights is None else unit_weights(weights, n)
+    w = unit_weights(weights, n)
     mean = float((w * units).mean())
     return Estimate(mean, *standard_error(w * (units - mean), groups))
 
@@ -130,14 +130,16 @@ def standard_error(residuals: NDArray[np.float64], groups: ArrayLike | None) -> 
     return float(np.linalg.norm(sums)) / math.sqrt(n * (n / count) * (count - 1)), count
 
 
-def unit_weights(weights: ArrayLike, n: int) -> NDArray[np.float64]:
-    """Weights (n,) as float64 with mean 1.
+def unit_weights(weights: ArrayLike | None, n: int) -> NDArray[np.float64]:
+    """Weights (n,) as float64 with mean 1; all 1 where there are none.
 
     Raises
     ------
     InputError : NaN or infinity
     ValueError : another length, or not positive
     """
+    if weights is None:
+        return np.ones(n)
     w = checked(weights, "weights")
     if w.shape != (n,) or not (w > 0).all():
         raise ValueError(f"weights must be {n} positive numbers")

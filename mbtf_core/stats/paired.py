@@ -105,7 +105,7 @@ def pooled_relative_error(a: ArrayLike, b: ArrayLike, weights: ArrayLike | None 
     weights : (n,) array_like, optional
     """
     first, second = _pair(a, b)
-    w, value = _weights(weights, len(first)), per_unit((first + second) / 2.0)
+    w, value = unit_weights(weights, len(first)), per_unit((first + second) / 2.0)
     mean = float((w * value).mean())
     # The square of the mean, linear in the values.
     square = w * mean * (2.0 * value - mean)
@@ -173,7 +173,7 @@ def signal_variance(
     weights, groups : (n,) array_like, optional
     """
     first, second = _pair(a, b)
-    products, correction = _centered_products(first, second, _weights(weights, len(first)))
+    products, correction = _centered_products(first, second, unit_weights(weights, len(first)))
     spread = mean_estimate(products, weights, groups)
     if spread.n < 2:
         return Estimate(math.nan, math.inf, spread.n)
@@ -207,7 +207,7 @@ def unexplained_variance(
     ValueError : shapes differ
     """
     p, first, second = _with_prediction(prediction, a, b)
-    w = _weights(weights, len(p))
+    w = unit_weights(weights, len(p))
     products, correction = _centered_products(first, second, w)
     return _ratio(w * per_unit((p - first) * (p - second)), w * (products + correction), groups)
 
@@ -229,11 +229,6 @@ def psnr(mse: Estimate, peak: float) -> Estimate:
         return Estimate(math.inf, math.inf, mse.n)
     value = 10.0 * math.log10(peak**2 / mse.value)
     return Estimate(value, 10.0 / math.log(10.0) * mse.relative_error, mse.n)
-
-
-def _weights(weights: ArrayLike | None, n: int) -> NDArray[np.float64]:
-    """Weights (n,) with mean 1; all 1 where there are none."""
-    return np.ones(n) if weights is None else unit_weights(weights, n)
 
 
 def _centered_products(

@@ -108,7 +108,7 @@ def export_material(
             claimed.finished(EXPORT.format)
         written, error = round_material(loaded, texture_format) if texture_format else (loaded, None)
         form = texture_format or loaded.texture_format
-        export = Export(material, folder, written, form, _is_material(folder), console)
+        export = Export(material, folder, written, form, console)
         if error is not None:
             export.notes.append(str(error))
         files: list[str] = []
@@ -120,16 +120,6 @@ def export_material(
     lines = [f"{folder / name}: {size / 1e6:.3f} MB" for name, size in sizes.items()]
     report = {"folder": folder, "files": sizes, "rounding": None if error is None else asdict(error)}
     console.report(report | export.report, "\n".join([*lines, *export.notes]))
-
-
-def _is_material(folder: Path) -> bool:
-    from mbtf_fit.material.material import Material
-
-    try:
-        Material.load(folder)
-    except InputError:
-        return False
-    return True
 
 
 def digest_of(value: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -78,7 +79,8 @@ def fit(
             raise UsageError(what, hint=hint)
     if many is not None:
         if shared_decoder:
-            options = options.assigning("training.shared_decoder=true")
+            own = [*(options.assignments or ()), "training.shared_decoder=true"]
+            options = replace(options, assignments=own)  # type: ignore[type-var]
         made = not output.exists()
         try:
             _fit_many(options, quality, many, output, cluster, overwrite, console)

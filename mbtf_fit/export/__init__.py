@@ -38,7 +38,6 @@ class Export:
     folder : where to write
     material : as it is written: rounded to the format
     form : of textures, to which the material is rounded
-    complete : whether the folder holds this export already, as a valid material
     console : for progress
     notes : lines for people, which targets add
     report : plain data for ``--json``, which targets add
@@ -49,7 +48,6 @@ class Export:
     folder: Path
     material: Material
     form: TextureFormat
-    complete: bool
     console: Console
     notes: list[str] = field(default_factory=list)
     report: dict[str, Any] = field(default_factory=dict)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mbtf_core.extras import extra_error, has_extra
-from mbtf_core.files.atomic import write_chunks, write_text
+from mbtf_core.files.atomic import write_file, write_text
 from mbtf_core.paths import real_path
 from mbtf_fit.export import Export, ExportTarget, flags
 
@@ -38,60 +38,39 @@ class MapOptions:
     level: int | None = None
 
 
-def write_maps(
-    export: Export,
-    options: MapOptions,
-    name: str,
-    text: Callable[[Maps, str, dict[str, Any]], str],
-    module: str,
-) -> list[str]:
-    """Write the maps of a material as images, once for all documents of an export, and a document.
-
-    Parameters
-    ----------
-    name : of the document
-    text : of maps, the material's name, and plain data that identify the neural material and the maps
-    module : the library that makes the document
-
-    Returns
-    -------
-    list of str
-        Names of the files.
-
-    Raises
-    ------
-    UsageError : the material has no such level
-    EngineError : the library is not installed
-    PartialError : the folder cannot be written
-    """
-    if not has_extra(module):
-        raise extra_error(module, name)
-    if "maps" not in export.shared:
-        from mbtf_fit.maps.maps import make_maps
-
-        maps, unexplained = make_maps(export.material, options.level, export.console)
-        export.shared["maps"] = maps, write_images(maps, export.folder)
-        export.notes.append(f"{maps}; unexplained variance against the material {unexplained}")
-        export.report["maps"] = {**maps.as_dict(), "unexplained": unexplained.as_dict()}
-    maps, images = export.shared["maps"]
-    described = {
-        "neural_material": Path(os.path.relpath(export.source, export.folder)).as_posix(),
-        "model": export.material.model.name,
-        "weights_sha256": export.material.description["weights"]["sha256"],
-        "level": maps.level,
-        **({} if maps.heights is None else {"height_range_in_tile_widths": round(maps.height_range, 9)}),
-    }
-    write_text(export.folder / name, text(maps, real_path(export.source).name, described))
-    return [*images, name]
-
-
 def document_target(
     name: str, help: str, file: str, text: Callable[[Maps, str, dict[str, Any]], str], module: str
 ) -> ExportTarget:
-    """The target that writes maps and a document; `text` and `module` as in :func:`write_maps`."""
+    """The target that writes the maps of a material as images, once for all documents of an export, and a
+    document.
+
+    Parameters
+    ----------
+    file : name of the document
+    text : of maps, the material's name, and plain data that identify the neural material and the maps
+    module : the library that makes the document
+    """
 
     def write(export: Export, options: MapOptions) -> list[str]:
-        return write_maps(export, options, file, text, module)
+        if not has_extra(module):
+            raise extra_error(module, file)
+        if "maps" not in export.shared:
+            from mbtf_fit.maps.maps import make_maps
+
+            maps, unexplained = make_maps(export.material, options.level, export.console)
+            export.shared["maps"] = maps, write_images(maps, export.folder)
+            export.notes.append(f"{maps}; unexplained variance against the material {unexplained}")
+            export.report["maps"] = {**maps.as_dict(), "unexplained": unexplained.as_dict()}
+        maps, images = export.shared["maps"]
+        described = {
+            "neural_material": Path(os.path.relpath(export.source, export.folder)).as_posix(),
+            "model": export.material.model.name,
+            "weights_sha256": export.material.description["weights"]["sha256"],
+            "level": maps.level,
+            **({} if maps.heights is None else {"height_range_in_tile_widths": round(maps.height_range, 9)}),
+        }
+        write_text(export.folder / file, text(maps, real_path(export.source).name, described))
+        return [*images, file]
 
     return ExportTarget(name, help, [file, *IMAGE_NAMES], write, MapOptions)
 
@@ -122,7 +101,5 @@ def write_images(maps: Maps, folder: Path) -> list[str]:
     for name, image in images.items():
         kind = np.uint16 if name == HEIGHT else np.uint8
         pixels = np.rint(np.clip(image, 0.0, 1.0) * np.iinfo(kind).max).astype(kind)
-        encoded = io.BytesIO()
-        Image.fromarray(pixels).save(encoded, format="PNG", compress_level=9)
-        write_chunks(folder / name, [encoded.getvalue()])
+        write_file(folder / name, partial(Image.fromarray(pixels).save, format="PNG", compress_level=9))
     return list(images)

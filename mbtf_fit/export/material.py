@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
+from mbtf_core.errors import InputError
 from mbtf_fit.export import Export, ExportTarget
 
 _NAMES = ["weights.safetensors", "material.json", "transmittance.safetensors"]
@@ -11,23 +14,27 @@ def write(export: Export, options: None) -> list[str]:
     """Write a material folder, unless the folder holds it already."""
     from mbtf_fit.export.checks import check_values
     from mbtf_fit.material.format import DESCRIPTION_NAME, QUERY
+    from mbtf_fit.material.material import Material
     from mbtf_fit.material.material import export as write_material
 
     material, description = export.material, export.material.description
-    if not export.complete:
-        written = write_material(
-            material.model,
-            material.config,
-            export.folder,
-            data=description["data"],
-            training=description["training"],
-            form=export.form,
-            transmittance=material.transmittance,
-            sampler=material.sampler,
-        )
-        found = written.evaluate(*(material.conformance[name] for name in QUERY))
-        check_values(found, material, export.folder / DESCRIPTION_NAME)
-    return _NAMES if material.transmittance is not None else _NAMES[:2]
+    names = _NAMES if material.transmittance is not None else _NAMES[:2]
+    with suppress(InputError):
+        Material.load(export.folder)
+        return names
+    written = write_material(
+        material.model,
+        material.config,
+        export.folder,
+        data=description["data"],
+        training=description["training"],
+        form=export.form,
+        transmittance=material.transmittance,
+        sampler=material.sampler,
+    )
+    found = written.evaluate(*(material.conformance[name] for name in QUERY))
+    check_values(found, material, export.folder / DESCRIPTION_NAME)
+    return names
 
 
 TARGET = ExportTarget(

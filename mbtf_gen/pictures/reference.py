@@ -141,13 +141,11 @@ def render_reference(
     estimates = estimator.estimate(queries.flat(), spp, stream, rays)
     shape, through = (*queries.lead, 3), estimates.transmittance
     return ReferenceImage(
-        kind,
-        camera,
-        queries,
         estimates.value_a.reshape(shape),
         estimates.value_b.reshape(shape),
         spp,
         None if through is None else through.reshape(queries.lead),
+        queries,
     )
 
 

@@ -16,15 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_core.data.shard_files import write_exr
 from mbtf_core.errors import InputError, UsageError
-from mbtf_core.pictures import PIXEL_SIGMA, Camera
+from mbtf_core.pictures import PIXEL_SIGMA, Camera, ReferenceImage
 from mbtf_gen.config.pictures import Shape
 from mbtf_gen.job import Job
 from mbtf_gen.sampling.light_kernel import LightKernel
@@ -197,37 +195,6 @@ def shape_scene(
     )
 
 
-@dataclass(frozen=True)
-class ShapeImage:
-    """A picture of a shape.
-
-    Attributes
-    ----------
-    value_a, value_b : (rows, columns, 3) float32 array
-        Independent halves, in 1/sr for unit irradiance.
-    transmittance : (rows, columns) float32 array
-        Share of a pixel that shows the background.
-    spp : paths per pixel, both halves together
-    """
-
-    value_a: NDArray[np.float32]
-    value_b: NDArray[np.float32]
-    transmittance: NDArray[np.float32]
-    spp: int
-
-    @property
-    def value(self) -> NDArray[np.float32]:
-        """Mean of the halves, (rows, columns, 3)."""
-        return 0.5 * (self.value_a + self.value_b)
-
-    def write(self, path: Path) -> Path:
-        """Write ``path`` + ``.exr``, atomically, and return its path."""
-        arrays = {**vars(self), "spp": np.full(self.transmittance.shape, self.spp, np.float32)}
-        exr = path.with_name(f"{path.name}.exr")
-        write_exr(exr, {name: array[None] for name, array in arrays.items()}, complete=False)
-        return exr
-
-
 def render_shape(
     source: Job,
     displaced: Callable[[HeightGrid, Any], Any],
@@ -237,7 +204,7 @@ def render_shape(
     seed: int = 0,
     index: int = 0,
     max_depth: int = -1,
-) -> ShapeImage:
+) -> ReferenceImage:
     """Path-trace a displaced surface with Mitsuba's own path tracer.
 
     Parameters
@@ -273,10 +240,10 @@ def render_shape(
     return replace(image, value_a=across * image.value_a, value_b=across * image.value_b)
 
 
-def render_scene(scene: Any, spp: int, seed: Sequence[int]) -> ShapeImage:
+def render_scene(scene: Any, spp: int, seed: Sequence[int]) -> ReferenceImage:
     """Two halves of a picture of :func:`shape_scene`, with `spp`/2 paths per pixel each."""
     import mitsuba as mi
 
     seeds = np.random.default_rng([*seed, 2]).integers(1 << 31, size=2)
     a, b = (np.array(mi.render(scene, spp=max(1, spp // 2), seed=int(s)), np.float32) for s in seeds)
-    return ShapeImage(a[..., :3], b[..., :3], 1.0 - 0.5 * (a + b)[..., 3], spp)
+    return ReferenceImage(a[..., :3], b[..., :3], spp, 1.0 - 0.5 * (a + b)[..., 3])

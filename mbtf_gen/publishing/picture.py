@@ -6,7 +6,7 @@ Nothing is rendered.
 
 from __future__ import annotations
 
-import io
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mbtf_core.color import ALBEDO_EXPOSURE, to_display
 from mbtf_core.data.geometry import Geometry
 from mbtf_core.data.shard_files import Arrays
-from mbtf_core.files.atomic import Stored, write_chunks
+from mbtf_core.files.atomic import Stored, write_through
 from mbtf_gen.publishing.facts import mean_of
 
 F64 = NDArray[np.float64]
@@ -91,6 +91,4 @@ def write_picture(arrays: Arrays, aspect: float, geometry: Geometry | None, path
         shown = axes[1].imshow(geometry.heights, extent=extent, cmap="gray")
         axes[1].set(title="heights in tile widths", xticks=(), yticks=())
         figure.colorbar(shown, ax=axes[1], shrink=0.8)
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=100)
-    return write_chunks(path, [stream.getvalue()])
+    return write_through(path, partial(figure.savefig, format="png", dpi=100))

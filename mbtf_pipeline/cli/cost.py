@@ -8,11 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from mbtf_core.app.console import CONSOLE, Console
-from mbtf_core.app.options import (
-    Output,
-    Set,
-    command_line,
-)
+from mbtf_core.app.options import Output, Set, command_line
 from mbtf_core.errors import UsageError
 
 

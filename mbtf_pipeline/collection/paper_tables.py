@@ -12,17 +12,7 @@ from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun,
 from mbtf_pipeline.collection.recipes import Published, first_known
 from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_METRICS, PerceptualMetric
 from mbtf_pipeline.report.plots import points
-from mbtf_pipeline.tables import (
-    Cell,
-    Column,
-    Shown,
-    Table,
-    Thumbnail,
-    decibel,
-    estimate,
-    rows_of,
-    signed,
-)
+from mbtf_pipeline.tables import Cell, Column, Shown, Table, Thumbnail, decibel, estimate, rows_of, signed
 
 
 def _metric_column(metric: PerceptualMetric) -> Column:

@@ -46,9 +46,9 @@ class Entry:
     fits: Sequence[str] = ()
     problem: str = ""
 
-    def error(self, *keys: str) -> Estimate | None:
-        """``unexplained`` variance of the test queries, or of a group of them: mean over the seeds."""
-        return _over_seeds([_inside(errors, *keys) for errors in self.errors])
+    def error(self, band: str | None = None) -> Estimate | None:
+        """``unexplained`` variance of the test queries, or of a band of elevations: mean over the seeds."""
+        return _over_seeds([e if band is None else e["elevations"][band] for e in self.errors])
 
     def error_of_new_directions(self) -> Estimate | None:
         """``unexplained`` variance of the queries with light or view in a region that no training saw."""
@@ -92,12 +92,6 @@ def _over_seeds(records: Sequence[Any]) -> Estimate | None:
     return Estimate(fmean(e.value for e in found), math.hypot(seeds, noise), found[0].n, dof)
 
 
-def _inside(errors: Any, *keys: str) -> Any:
-    for key in keys:
-        errors = errors[key]
-    return errors
-
-
 def entries(runs: Sequence[FinishedRun]) -> Iterator[Entry]:
     """All methods on all materials, submissions last."""
     for run in runs:
@@ -122,9 +116,7 @@ def _submission(run: FinishedRun, file: Path) -> Entry:
 def _lowest(entry: Entry) -> Estimate | None:
     """Error of the queries whose light or view is in the lowest band of elevations."""
     bands = entry.errors[0]["elevations"] if entry.errors else {}
-    return (
-        entry.error("elevations", min(bands, key=lambda band: float(band.split("-")[0]))) if bands else None
-    )
+    return entry.error(min(bands, key=lambda band: float(band.split("-")[0]))) if bands else None
 
 
 _COLUMNS = (

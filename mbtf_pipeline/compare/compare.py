@@ -175,9 +175,10 @@ def _compare_scene(
         record["between_references"] = mean_estimate(square).as_dict()
     main_kind, main = next(iter(images.items()))
     record["references"][main_kind] |= perceptual_scores(main.value_a, main.value_b, white, with_st_lpips)[0]
-    level = level_of_sigma(main.queries.sigma)
-    record["levels"] = [round(float(level.min()), 3), round(float(level.max()), 3)]
+    assert main.queries is not None
     flat = main.queries.flat()
+    level = level_of_sigma(flat.sigma)
+    record["levels"] = [round(float(level.min()), 3), round(float(level.max()), 3)]
     arrays = flat.u, flat.sigma, flat.omega_i, flat.omega_o
     halves = [x.reshape(-1, 3) for x in (main.value_a, main.value_b)]
     first: F32 | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -52,12 +53,10 @@ class Scene:
 def scenes(compare: CompareSection) -> Iterator[Scene]:
     """All scenes of a comparison: views outermost, widths innermost. Only their number is right where the
     widths are those of the data."""
-    index = 0
-    for v, view in enumerate(compare.views, 1):
-        for n, light in enumerate(compare.lights, 1):
-            for s, tiles_across in enumerate(compare.tiles_across or PIXEL_TEXELS, 1):
-                yield Scene(index, f"v{v}-l{n}-s{s}", view, light, tiles_across)
-                index += 1
+    widths = compare.tiles_across or PIXEL_TEXELS
+    numbered = product(enumerate(compare.views, 1), enumerate(compare.lights, 1), enumerate(widths, 1))
+    for index, ((v, view), (n, light), (s, tiles_across)) in enumerate(numbered):
+        yield Scene(index, f"v{v}-l{n}-s{s}", view, light, tiles_across)
 
 
 def with_ending(path: Path, ending: str) -> Path:

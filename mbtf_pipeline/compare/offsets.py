@@ -58,11 +58,11 @@ def towards_view(offset: F32, view: SceneView) -> F32:
     return along
 
 
-def _regression(x: F32, y: F32) -> dict[str, float | None]:
-    """Pearson's r, and slope of the regression of y on x; None where they are undefined."""
+def _correlation(x: F32, y: F32) -> float | None:
+    """Pearson's r; None where it is undefined."""
     a, b = (v.astype(np.float64).ravel() - v.mean(dtype=np.float64) for v in (x, y))
-    norms = {"correlation": float(np.linalg.norm(a) * np.linalg.norm(b)), "slope": float(a @ a)}
-    return {name: float(a @ b) / norm if norm > 1e-20 else None for name, norm in norms.items()}
+    norm = float(np.linalg.norm(a) * np.linalg.norm(b))
+    return float(a @ b) / norm if norm > 1e-20 else None
 
 
 def write_offsets(
@@ -72,12 +72,8 @@ def write_offsets(
     lattice: Lattice,
     out: Path,
 ) -> list[dict[str, Any]]:
-    """Write traced and learned offsets of every view below `out`; returns plain data about them.
-
-    ``spread`` is the standard deviation over the tile of the displacement towards the viewer, in tile widths.
-    For learned offsets, ``correlation`` is Pearson's r with the traced offset and ``slope`` is that of the
-    regression on it, which is 1 for equal magnitude. Models without an offset are left out.
-    """
+    """Write traced and learned offsets of every view below `out`; returns plain data about them, such as the
+    correlation of learned ones with the traced one. Models without an offset are left out."""
     level = min(lattice.finest, int(np.log2(_MAX_RESOLUTION)))
     rows, columns = lattice.shape(level)
     u = texel_centers(rows, columns).reshape(-1, 2).astype(np.float32)
@@ -98,16 +94,11 @@ def write_offsets(
         write_channels(out / file, truth.reshape(rows, columns, 2), "XY")
         along = towards_view(truth, view)
         record: dict[str, Any] = {"view": view.model_dump(), "traced": file, "fits": {}}
-        record["spread"] = float(along.std(dtype=np.float64))
         for name, offsets in learned.items():
             offset = offsets[number - 1]
             file = f"{OFFSETS}/v{number}-fit-{name}.exr"
             write_channels(out / file, offset.reshape(rows, columns, 2), "XY")
-            moved = towards_view(offset, view)
-            record["fits"][name] = {
-                "file": file,
-                **_regression(along, moved),
-                "spread": float(moved.std(dtype=np.float64)),
-            }
+            found = _correlation(along, towards_view(offset, view))
+            record["fits"][name] = {"file": file, "correlation": found}
         records.append(record)
     return records

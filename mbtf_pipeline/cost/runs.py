@@ -12,7 +12,6 @@ import shlex
 import shutil
 import time
 import timeit
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -23,7 +22,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mbtf_core.config.settings import deep_merge, nested
-from mbtf_core.data.shard_files import row_bytes
 from mbtf_core.files.atomic import data_sha256
 from mbtf_core.stats import Estimate, unexplained_variance
 from mbtf_fit.config import DEFAULT_MODEL, best_options
@@ -125,14 +123,6 @@ class Run(Configuration):
         return Measurement(self.study, self.series, self.name, command, took, error, details=details)
 
 
-def shortest_total(step_seconds: float) -> float:
-    """Shortest total time of a run that has the fewest steps of `step_seconds` each."""
-    total = SHORTEST
-    while (1 - SHARE) * total < FEWEST_STEPS * step_seconds:
-        total *= 2
-    return total
-
-
 def planned_runs(seconds: float, spp: int, path_seconds: float, step_seconds: float = 0.0) -> list[Run]:
     """All runs of a study of some seconds, in the order of measuring, with `spp` paths per query of
     `path_seconds` each, and no fewer training steps than :data:`FEWEST_STEPS` of `step_seconds` each.
@@ -141,7 +131,9 @@ def planned_runs(seconds: float, spp: int, path_seconds: float, step_seconds: fl
     left goes to other shares of generating, shortest first, and to further second seeds.
     """
     left = seconds * RUNS
-    totals = [shortest_total(step_seconds)]
+    totals = [SHORTEST]
+    while (1 - SHARE) * totals[0] < FEWEST_STEPS * step_seconds:
+        totals[0] *= 2
     while 2 * sum(totals) + 2 * totals[-1] <= left:
         totals.append(2 * totals[-1])
     others = list(product(OTHER_SHARES, (0, 1)))
@@ -162,11 +154,6 @@ def planned_runs(seconds: float, spp: int, path_seconds: float, step_seconds: fl
         series = f"{100 * share:.0f}% of the time for generating"
         runs.append(Run("run", series, f"planned for {total:g} s", queries, spp, fit, seed))
     return runs
-
-
-def disk_bytes(runs: Sequence[Run]) -> int:
-    """Disk space that runs take at most: the test set, and the data of one run."""
-    return (TEST[0] + max((run.queries for run in runs), default=0)) * row_bytes(holes=True)
 
 
 @lru_cache(maxsize=1)

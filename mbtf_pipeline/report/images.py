@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from mbtf_core.color import (
     Palette,
-    common_scale,
     indices,
     palette,
     robust_scale,
@@ -278,7 +277,7 @@ def _offset_row(
     ]
     medians = [float(np.median(m)) for m in whole]
     maps: list[Pixels] = [m - median for m, median in zip(whole, medians, strict=True)]
-    scale, cells = common_scale(maps), []
+    scale, cells = robust_scale([maps]), []
     for number, (record, values, median) in enumerate(zip(records, maps, medians, strict=True)):
         name = f"offset-{fit or 'traced'}-{number}"
         gallery[name] = map_uri(values / scale, "signed")

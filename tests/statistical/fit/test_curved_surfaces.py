@@ -14,12 +14,12 @@ from support.plugin_materials import write_material
 from mbtf_core.data.geometry import Geometry
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.directions import from_angles
-from mbtf_core.pictures import Camera
+from mbtf_core.pictures import Camera, ReferenceImage
 from mbtf_fit.backends.mitsuba import register
 from mbtf_fit.surface.known import KnownSurface
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.job import Job
-from mbtf_gen.pictures.shapes import Chart, ShapeImage, render_scene, render_shape, shape_scene
+from mbtf_gen.pictures.shapes import Chart, render_scene, render_shape, shape_scene
 
 register("llvm_ad_rgb")
 
@@ -44,7 +44,7 @@ def bumps(tmp_path_factory: pytest.TempPathFactory) -> tuple[Job, Path]:
     return job, folder / "material"
 
 
-def picture(shape: str, around: int, bumps: tuple[Job, Path], camera: Camera, **bsdf: Any) -> ShapeImage:
+def picture(shape: str, around: int, bumps: tuple[Job, Path], camera: Camera, **bsdf: Any) -> ReferenceImage:
     """The material on the smooth shape."""
     material = {"type": "mbtf", "material": str(bumps[1]), **bsdf}
     mesh = Chart(shape, around, 1.0).mesh(None, material, 48)
@@ -52,20 +52,20 @@ def picture(shape: str, around: int, bumps: tuple[Job, Path], camera: Camera, **
     return render_scene(shape_scene(mesh, camera, LIGHT, path), SPP, [1])
 
 
-def outline(image: ShapeImage) -> NDArray[np.bool_]:
+def outline(image: ReferenceImage) -> NDArray[np.bool_]:
     """Pixels at the border of what the shape covers."""
     inside = np.pad(image.transmittance < 0.5, 1)
     around = [np.roll(inside, step, axis) for axis in (0, 1) for step in (-1, 1)]
     return (inside & ~np.logical_and.reduce(around))[1:-1, 1:-1]
 
 
-def outline_distance(a: ShapeImage, b: ShapeImage) -> float:
+def outline_distance(a: ReferenceImage, b: ReferenceImage) -> float:
     """Mean distance of two outlines in pixels."""
     lines = outline(a), outline(b)
     return float(np.mean([distance_transform_edt(~x)[y].mean() for x, y in (lines, lines[::-1])]))
 
 
-def blocks(image: ShapeImage) -> NDArray[np.float64]:
+def blocks(image: ReferenceImage) -> NDArray[np.float64]:
     """Means of 16 × 16 pixels."""
     gray = image.value.mean(-1).astype(np.float64)
     return gray.reshape(SIZE // 16, 16, -1, 16).mean((1, 3))

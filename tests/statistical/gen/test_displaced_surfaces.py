@@ -11,12 +11,12 @@ from support.scenes import mi
 from support.unmodified_mitsuba import agree, differences
 
 from mbtf_core.directions import from_angles
-from mbtf_core.pictures import Camera
+from mbtf_core.pictures import Camera, ReferenceImage
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.pictures import Shape
 from mbtf_gen.job import Job
 from mbtf_gen.pictures.displaced_mesh import DisplacedMesh
-from mbtf_gen.pictures.shapes import Chart, ShapeImage, render_shape
+from mbtf_gen.pictures.shapes import Chart, render_shape
 
 SIZE, SPP = 72, 32
 F64 = NDArray[np.float64]
@@ -41,7 +41,7 @@ def written(path: Path, position: F64, uv: F64, faces: F64) -> DisplacedMesh:
     return DisplacedMesh.read(path, 1.0, 1.0, "z")
 
 
-def halves(image: ShapeImage) -> tuple[F64, F64]:
+def halves(image: ReferenceImage) -> tuple[F64, F64]:
     """Those of a picture."""
     return image.value_a.astype(np.float64), image.value_b.astype(np.float64)
 

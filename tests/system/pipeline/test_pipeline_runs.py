@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import re
 import subprocess
 import sys
@@ -162,17 +163,15 @@ def test_a_cost_study_measures_reports_and_resumes(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two configurations of the generator, then a third one and a run."""
-    from mbtf_pipeline.cost import schedule
+    from mbtf_pipeline.cost import study
     from mbtf_pipeline.cost.generator import generator_configurations
     from mbtf_pipeline.cost.runs import planned_runs
 
     some, runs = 2, 0
     all_of = generator_configurations
-    monkeypatch.setattr(
-        schedule, "generator_configurations", lambda benchmark: islice(all_of(benchmark), some)
-    )
-    monkeypatch.setattr(schedule, "planned_runs", lambda *arguments: planned_runs(30.0, *arguments[1:])[:1])
-    monkeypatch.setattr(schedule.Measurements, "fits", lambda *_: runs > 0)
+    monkeypatch.setattr(study, "generator_configurations", lambda benchmark: islice(all_of(benchmark), some))
+    monkeypatch.setattr(study, "planned_runs", lambda *arguments: planned_runs(30.0, *arguments[1:])[:1])
+    monkeypatch.setattr(study.Measurements, "expected_seconds", lambda *_: 0.0 if runs else math.inf)
     monkeypatch.setattr("mbtf_pipeline.cost.measurement._CONFIGURATIONS", 1000)
     monkeypatch.setattr("mbtf_pipeline.cost.runs.SHORTEST", 4.0)
     monkeypatch.setattr("mbtf_pipeline.cost.runs.FEWEST_STEPS", 2)

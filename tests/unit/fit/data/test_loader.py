@@ -71,7 +71,6 @@ def test_queries_know_their_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     # Whole groups are held out, of both shards.
     assert (np.unique(np.concatenate(labels), return_counts=True)[1] == 4).all()
     errors = split_errors(lambda queries: queries.value_a, found.held_out_queries, data)
-    assert errors is not None
     assert errors["n"] == len(labels[0])
     assert errors["mse"]["n"] == len(np.unique(labels[0])) < 0.5 * len(labels[0])
 

@@ -110,5 +110,5 @@ def test_what_hardware_cannot_read_is_refused(
 ) -> None:
     material = write_material(tmp_path, aspect=aspect)
     with pytest.raises((InputError, UsageError), match=fault):
-        targets()["dds"].write(Export(tmp_path, tmp_path, material, form, False, CONSOLE), None)
+        targets()["dds"].write(Export(tmp_path, tmp_path, material, form, CONSOLE), None)
     assert not (tmp_path / "layers.json").exists()

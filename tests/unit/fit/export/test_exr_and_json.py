@@ -75,7 +75,7 @@ def test_an_export_is_sufficient_for_evaluation(case: str, form: TextureFormat, 
     material = make(case, tmp_path, contrast=1.0)
     written, half = round_material(material, form)[0], form != "float32"
     for name in ("exr", "json"):
-        targets()[name].write(Export(tmp_path, tmp_path, written, form, False, CONSOLE), None)
+        targets()[name].write(Export(tmp_path, tmp_path, written, form, CONSOLE), None)
     reader = Reader(tmp_path)
     assert reader.document["precision"] == form
     expected = np.array(reader.document["conformance"]["rgb"])

@@ -133,8 +133,6 @@ def test_errors_of_a_perfect_prediction_are_zero(data: Path) -> None:
     truth = parallax(queries.u, queries.sigma, queries.omega_i, queries.omega_o).astype(np.float32)
     perfect = split_errors(lambda q: truth, queries, opened)
     flat = split_errors(lambda q: np.full_like(truth, truth.mean(0)), queries, opened)
-    assert perfect is not None
-    assert flat is not None
     assert abs(perfect["mse"]["value"]) < 4 * perfect["mse"]["error"]
     assert flat["unexplained"]["value"] == pytest.approx(1.0, abs=0.02)
     # Of color likewise, although its noise is as large as its variance.
@@ -152,7 +150,6 @@ def test_gray_data_have_no_error_of_color(data: Path) -> None:
     stored = load_split(opened, "test")
     gray = np.repeat(stored.value_a[:, :1], 3, axis=1)
     found = split_errors(lambda q: 1.1 * gray, replace(stored, value_a=gray, value_b=gray), opened)
-    assert found is not None
     assert found["unexplained"]["value"] is not None
     assert found["color"]["value"] is None
 
@@ -168,7 +165,6 @@ def test_few_queries_that_decide_an_error_are_said(data: Path) -> None:
         weight = None if heavy is None else np.where(wrong[:, 0] == 1, heavy, 1).astype(np.float32)
         queries = ShardQueries(**(vars(stored) | {"value_b": truth, "weight": weight}))
         found = split_errors(lambda q: truth + wrong, queries, opened)
-        assert found is not None
         ten = 10 * (heavy or 1.0)
         assert found["ten_largest"] == pytest.approx(ten / (ten + 0.01 * (n - 10)), rel=1e-3)
 

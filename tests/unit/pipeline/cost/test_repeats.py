@@ -20,7 +20,7 @@ from mbtf_pipeline.cost.measurement import (
     seed_deviation,
 )
 from mbtf_pipeline.cost.runs import Run
-from mbtf_pipeline.cost.schedule import Measurements
+from mbtf_pipeline.cost.study import Measurements
 
 RUNS = [run(3000, "long", 9.0), run(3000, "short", 4.0), run(2000, "one"), run(2000, "two")]
 RUNS += [run(1000 + n, f"{n}") for n in range(8)]

@@ -38,6 +38,8 @@ def test_planned_runs_fit_into_the_time(seconds: float) -> None:
     doubling = [run for run in found if "35%" in run.series and run.seed == 0]
     assert found[: len(doubling)] == doubling
     assert all(run in longer for run in doubling)
+    # The shortest run has the fewest steps, here of 0.1 s each, and not many more.
+    assert 20.0 <= planned_runs(seconds, 4, 7.5e-7, 0.1)[0].planned_seconds(0.0) < 40.0
 
 
 @pytest.fixture

@@ -16,7 +16,6 @@ from support.paths import ROOT
 
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.stats import Estimate
-from mbtf_pipeline.cost import schedule
 from mbtf_pipeline.cost import study as module
 from mbtf_pipeline.cost.generator import GeneratorBenchmark, GeneratorConfiguration
 from mbtf_pipeline.cost.measurement import (
@@ -25,7 +24,7 @@ from mbtf_pipeline.cost.measurement import (
     MeasurementFolder,
 )
 from mbtf_pipeline.cost.runs import Run
-from mbtf_pipeline.cost.schedule import Measurements
+from mbtf_pipeline.cost.study import Measurements
 from mbtf_pipeline.recipe import load_recipe
 
 RECIPE = ROOT / "pipelines" / "quickstart.yaml"
@@ -68,6 +67,8 @@ def test_a_run_that_fails_does_not_stop_the_others(monkeypatch: pytest.MonkeyPat
     found.measure_runs(planned, lambda run: True)
     assert found.failed == {runs[2].label: "training diverged at step 7"}
     assert [len(found.group(run)) for run in runs] == [2, 2, 0]
+    # Training, and what the others have taken besides, at most.
+    assert found.expected_seconds(runs[1]) == 24.0
 
 
 RUNS = [run(3000, "long", 7200.0), run(2000, "short", 60.0), run(1000, "m", 40.0)]
@@ -88,11 +89,11 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> FakeRuns:
     configuration = GeneratorConfiguration("paths", "uniform", "4", {"queries.spp": 4}, None)
     monkeypatch.setattr(module, "time", clock)
     monkeypatch.setattr(Run, "measure", measure)
-    monkeypatch.setattr(schedule, "generator_configurations", lambda benchmark: [configuration])
+    monkeypatch.setattr(module, "generator_configurations", lambda benchmark: [configuration])
     monkeypatch.setattr(GeneratorBenchmark, "check_variation", lambda benchmark: None)
     planned = [replace(run, seed=seed) for run in RUNS for seed in range(2)]
-    monkeypatch.setattr(schedule, "planned_runs", lambda *_: planned)
-    monkeypatch.setattr(schedule, "path_seconds", lambda *_: 1e-9)
+    monkeypatch.setattr(module, "planned_runs", lambda *_: planned)
+    monkeypatch.setattr(module, "path_seconds", lambda *_: 1e-9)
     return found
 
 
