@@ -7,7 +7,9 @@ Pages are encoded by BYTE_STREAM_SPLIT and compressed by Zstandard: both are los
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -20,7 +22,7 @@ from mbtf_core.data.dataset import Shard
 from mbtf_core.data.folder import sidecar_name
 from mbtf_core.data.shard_files import Arrays
 from mbtf_core.extras import import_extra
-from mbtf_core.files.atomic import Stored, write_chunks, write_through
+from mbtf_core.files.atomic import Stored, file_sha256, sync_folder, temporary_of, write_chunks, write_through
 from mbtf_gen.config.exchange import Form
 
 Described = Mapping[str, Mapping[str, Any]]
@@ -47,7 +49,7 @@ def shard_writers(
     """
     first, *rest = published_names(shard, form)
     if form == "npz":
-        return {first: lambda path: copied(shard.local(), path)} | {
+        return {first: lambda path: copied(shard.local(), path, link=True)} | {
             name: lambda path, name=name: write_chunks(path, [shard.folder.read(name)]) for name in rest
         }
     return {first: partial(write_parquet, arrays=arrays, described=described)}
@@ -85,7 +87,20 @@ def _column(array: NDArray[np.float32]) -> Any:
     return column
 
 
-def copied(source: Path, path: Path) -> Stored:
-    """A copy of a file, atomically."""
+def copied(source: Path, path: Path, *, link: bool = False) -> Stored:
+    """A copy of a file, atomically; a hard link if asked for and the disk has them.
+
+    Shards are replaced, never changed in place, so that a link keeps its content.
+    """
+    if link:
+        temporary = temporary_of(path)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+            os.link(source, temporary)
+            os.replace(temporary, path)
+            # A rename does nothing if both names are links to one file already.
+            temporary.unlink(missing_ok=True)
+            sync_folder(path.parent)
+            return Stored(path.stat().st_size, file_sha256(path))
     with source.open("rb") as stream:
         return write_chunks(path, iter(lambda: stream.read(_CHUNK), b""))

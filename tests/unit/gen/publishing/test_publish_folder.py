@@ -56,7 +56,7 @@ def test_shards_are_published_as_they_are(work: Path, tmp_path: Path) -> None:
         assert str(work).encode() not in content
 
 
-def test_copies_do_not_change_with_the_data_set(tmp_path: Path) -> None:
+def test_links_do_not_change_with_the_data_set(tmp_path: Path) -> None:
     small(tmp_path / "data")
     card = publish(tmp_path / "data", tmp_path / "card", form="npz")
     before = contents(card)
