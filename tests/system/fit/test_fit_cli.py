@@ -10,7 +10,7 @@ import pytest
 from support.command_lines import call
 from support.commands import run_all
 from support.fit_data import parallax, write_data
-from support.measured_files import photographs, zipped
+from support.measured_files import photographs, write_folder
 
 QUICK = ("--steps", "5", "--batch", "500")
 
@@ -65,8 +65,8 @@ SMALL = "--size 64 --view 60,0 --light 60,0 --tiles-across 1"
 @pytest.fixture(scope="module")
 def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("measured")
-    (folder / "felt.zip").write_bytes(zipped(photographs()))
-    command = "import felt.zip --cosine included --scale 0.3183 --queries 20/texel -o felt"
+    write_folder(folder / "photographs", photographs())
+    command = "import photographs --cosine included --scale 0.3183 --queries 20/texel -o felt"
     (done,) = run_all([command.split()], folder)
     assert done.code == 0, done.err
     return folder

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -110,9 +107,8 @@ print(drjit.thread_count())
 """
 
 
-def test_a_worker_renders_with_its_threads() -> None:
-    environment = {**os.environ, THREADS_VARIABLE: "3"}
-    shown = subprocess.run([sys.executable, "-c", SHOWN], env=environment, capture_output=True, text=True)
+def test_a_worker_renders_with_its_threads(run_python: RunPython) -> None:
+    shown = run_python("-c", SHOWN, **{THREADS_VARIABLE: "3"})
     assert shown.stdout.split() == ["3"], shown.stderr
 
 
