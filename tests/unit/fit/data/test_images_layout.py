@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from support.fit_data import constant, parallax, random_queries, write_data
-from support.image_data import random_images, write_images
+from support.fit_data import constant, parallax, random_images, random_queries, write_data, write_images
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice, sigma_of_level
