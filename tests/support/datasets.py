@@ -190,9 +190,11 @@ FOREIGN: dict[str, tuple[Callable[[Path, Path, str], object], str]] = {
 }
 
 
-def sidecar_of(shard: Path) -> Path:
-    """The JSON file beside a shard."""
-    return shard.with_suffix(".json")
+def flip(path: Path, at: int) -> None:
+    """Flip a bit of a file."""
+    content = bytearray(path.read_bytes())
+    content[at] ^= 4
+    path.write_bytes(content)
 
 
 def read_checksummed(path: Path) -> dict[str, Any]:

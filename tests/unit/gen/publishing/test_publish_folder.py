@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from support.datasets import flip
 from support.published import LAYOUTS, contents, publish, small
 
 from mbtf_core.data.verify import verify
@@ -27,10 +28,7 @@ def test_the_same_command_gives_the_same_bytes(form: str, shards: Path, tmp_path
 
 
 def test_damage_is_found_before_anything_is_written(shards: Path, tmp_path: Path) -> None:
-    path = shards / "train-00001.npz"
-    content = bytearray(path.read_bytes())
-    content[-200] ^= 1
-    path.write_bytes(content)
+    flip(shards / "train-00001.npz", -200)
     with pytest.raises(InputError, match=r"train-00001\.npz: has changed since it was written"):
         publish(shards, tmp_path / "card", form="parquet")
     assert not (tmp_path / "card").exists()
