@@ -27,10 +27,6 @@ def write_inputs(folder: Path) -> None:
     np.save(folder / "maps/height.npy", height)
 
 
-def pixels(path: Path) -> NDArray[np.float64]:
-    return np.asarray(Image.open(path).convert("RGB"), np.float64) / 255
-
-
 def quadrant(picture: NDArray[np.float64]) -> NDArray[np.intp]:
     """Which of the four colors each pixel has; -1 where that is not clear."""
     colors = np.array(list(QUADRANTS.values()), np.float64)
@@ -44,7 +40,7 @@ def test_colors_lie_in_the_quadrants_of_the_map(tmp_path: Path) -> None:
     write_inputs(tmp_path)
     (done,) = run_all([COMMAND.split()], tmp_path)
     assert done.code == 0, done.err
-    picture = quadrant(pixels(tmp_path / "tilted" / "beauty.png"))
+    picture = quadrant(np.asarray(Image.open(tmp_path / "tilted/beauty.png").convert("RGB")) / 255)
     # Positions close to the picture's middle, where the tile's middle is.
     for number, (down, right) in enumerate([(-5, -12), (-5, 12), (6, -12), (6, 12)]):
         part = picture[36 + down - 2 : 36 + down + 3, 48 + right - 4 : 48 + right + 5]

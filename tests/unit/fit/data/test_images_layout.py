@@ -28,11 +28,6 @@ def partition(folder: Path, held_out: HeldOutSection = HELD_OUT, seed: int = 0) 
     return load_training(Dataset.open(folder), held_out, seed)
 
 
-def images_of(part: Partition) -> TrainingImages:
-    assert isinstance(part.training, TrainingImages)
-    return part.training
-
-
 def numbered(q: Mapping[str, np.ndarray], *shape: np.ndarray) -> TrainingImages:
     """Images of queries (images, rows, columns, ...); the value's first channel numbers the queries."""
     number = np.arange(q["sigma"].size, dtype=np.float32).reshape(q["sigma"].shape)
@@ -53,7 +48,8 @@ def test_whole_images_are_held_out(tmp_path: Path) -> None:
     folder = write_images(tmp_path / "d", parallax, train=60)
     many = HeldOutSection(queries=0.4, radius=0.3)
     part = partition(folder, many)
-    training = images_of(part)
+    training = part.training
+    assert isinstance(training, TrainingImages)
     for q in (training, part.held_out_queries):
         for omega in (q.omega_i, q.omega_o):
             assert not in_region(many, np.asarray(omega)).any()
