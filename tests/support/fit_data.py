@@ -13,15 +13,17 @@ from numpy.typing import NDArray
 
 from mbtf_core.data.geometry import Geometry, encode_geometry, geometry_record
 from mbtf_core.data.lattice import Lattice, sigma_of_level, texel_centers
-from mbtf_core.data.schema import GEOMETRY_NAME, Queries
+from mbtf_core.data.schema import FORMAT_NAME, GEOMETRY_NAME, MANIFEST_NAME, SCHEMA_VERSION, Queries
+from mbtf_core.data.shard_files import write_shard
 from mbtf_core.directions import from_projected_disk
+from mbtf_core.files.atomic import write_checksummed
 from mbtf_fit.config import FitConfig, build_model
 from mbtf_fit.data.queries import TrainingQueries
 from mbtf_fit.objective.noise import NoiseModel, typical_value
 from mbtf_fit.training.loop import TrainingLoop
 from mbtf_fit.training.trainer import Trainer
 
-from .datasets import write_manifest, write_part
+from .datasets import write_sidecar
 from .known_surfaces import geometry as known_geometry
 
 F32 = NDArray[np.float32]
@@ -81,16 +83,16 @@ def write_splits(
     halves: Callable[[NDArray[np.float64]], dict[str, F32]],
     config_hash: str,
     *,
-    layout: str,
     through: Through | None = None,
     suffix: str = ".npz",
     **more: Any,
 ) -> Path:
-    """Write queries by split and shard with the `halves` of their values; returns the folder."""
+    """Write queries by split and shard with the `halves` of their values; returns the folder. The manifest
+    also says `more`."""
     folder.mkdir(parents=True, exist_ok=True)
     written: dict[str, Any] = {}
     for split, shards in splits.items():
-        entries, total = [], 0
+        entries = []
         for index, queries in enumerate(shards):
             lead, flat = queries["sigma"].shape, Queries(**queries).flat()
             value = function(flat.u, flat.sigma, flat.omega_i, flat.omega_o).reshape(*lead, 3)
@@ -98,12 +100,25 @@ def write_splits(
             if through is not None:
                 seen = through(flat.u, flat.sigma, flat.omega_o)
                 arrays["transmittance"] = seen.reshape(lead).astype(np.float32)
-            entries.append(write_part(folder, split, index, arrays, config_hash, suffix))
-            total += lead[0]
-        written[split] = total, entries
-    if through is not None:
-        more["arrays"] = {"transmittance": {}}
-    return write_manifest(folder, layout, lattice, config_hash, written, **more)
+            file = folder / f"{split}-{index:05d}{suffix}"
+            write_shard(file, arrays)
+            write_sidecar(file, split, index, config_hash)
+            entries.append({"file": file.name, "rows": lead[0]})
+        rows = sum(entry["rows"] for entry in entries)
+        written[split] = {"queries": rows, "shards": entries}
+    manifest = {
+        "format": FORMAT_NAME,
+        "schema": SCHEMA_VERSION,
+        "config_hash": config_hash,
+        "levels": {"finest": lattice.finest},
+        "tile": {"aspect": lattice.aspect},
+        "geometry": None,
+        "splits": written,
+        "arrays": {} if through is None else {"transmittance": {}},
+        **more,
+    }
+    write_checksummed(folder / MANIFEST_NAME, manifest)
+    return folder
 
 
 def write_data(
