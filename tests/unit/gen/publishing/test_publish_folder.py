@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from support.datasets import flip
-from support.published import LAYOUTS, contents, publish, small
+from support.published import contents, publish, small
 
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError
@@ -34,24 +34,16 @@ def test_damage_is_found_before_anything_is_written(shards: Path, tmp_path: Path
     assert not (tmp_path / "card").exists()
 
 
-@pytest.fixture(scope="module")
-def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("formats")
-    for layout in LAYOUTS:
-        small(folder / layout, layout)
-    return folder
-
-
-def test_shards_are_published_as_they_are(work: Path, tmp_path: Path) -> None:
-    card = publish(work / "shuffled", tmp_path / "card", form="npz")
+def test_shards_are_published_as_they_are(shards: Path, tmp_path: Path) -> None:
+    card = publish(shards, tmp_path / "card", form="npz")
     assert verify(card / "data") == []
-    mine, theirs = contents(work / "shuffled"), contents(card / "data")
+    mine, theirs = contents(shards), contents(card / "data")
     assert set(mine) == set(theirs)
     changed = {name for name in mine if mine[name] != theirs[name]}
     assert changed == {"manifest.json", "config.yaml"}
     # Nobody learns where the author keeps the material.
     for content in contents(card).values():
-        assert str(work).encode() not in content
+        assert str(tmp_path).encode() not in content
 
 
 def test_links_do_not_change_with_the_data_set(tmp_path: Path) -> None:

@@ -67,19 +67,14 @@ def test_an_installation_never_started_by_its_owner_works(run_python: RunPython,
     assert done.stdout == "llvm_ad_rgb\n"
 
 
-@pytest.fixture
-def library(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A library that the user chose, and an empty cache."""
-    path = tmp_path / "libLLVM.so.20.1"
-    path.write_bytes(b"x")
-    monkeypatch.setenv(engine.VARIABLE, str(path))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    return path
-
-
 def test_a_proof_is_cached_per_library_unless_it_fails(
-    library: Path, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    """Of a library that the user chose, with an empty cache."""
+    library = tmp_path / "libLLVM.so.20.1"
+    library.write_bytes(b"x")
+    monkeypatch.setenv(engine.VARIABLE, str(library))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     proofs, fault = [], "the process was ended by SIGABRT (LLVM ERROR: Cannot select)"
 
     def prove(variant: str) -> object:
