@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 from conftest import RunPython
-from support.datasets import edit, flip
+from support.datasets import edit
 from support.file_operations import FileOperations, Operation
 from support.paths import ROOT
 from support.small_runs import command, contents, die, ending, generate, in_child, noisy_plane
@@ -90,6 +90,12 @@ class Small:
         self.corrupt()
         (self.out / "config.yaml").write_bytes((self.whole / "config.yaml").read_bytes())
         flip(self.out / "manifest.json", 2000)
+
+
+def flip(path: Path, at: int, mask: int = 1) -> None:
+    content = bytearray(path.read_bytes())
+    content[at] ^= mask
+    path.write_bytes(content)
 
 
 def alike(operation: Operation) -> Operation:
