@@ -34,7 +34,7 @@ def ctrl_c_interrupts() -> None:
 RunPython = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def run_python() -> RunPython:
     """``run_python("-m", "mbtf_gen", …, KEY="value")`` in a fresh interpreter; None removes a variable."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -60,22 +59,3 @@ def run_all(lines: Sequence[Sequence[object]], folder: Path) -> list[Done]:
 def run_named(lines: Mapping[str, str], folder: Path) -> dict[str, Done]:
     """:func:`run_all` of command lines by name, as one types them."""
     return dict(zip(lines, run_all([line.split() for line in lines.values()], folder), strict=True))
-
-
-def start(line: Sequence[object], folder: Path) -> subprocess.Popen[str]:
-    """Start ``mbtf-gen`` itself in `folder`."""
-    return subprocess.Popen(
-        [sys.executable, "-m", "mbtf_gen", *(str(word) for word in line)],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=folder,
-        env={**os.environ, "COLUMNS": "100"},
-    )
-
-
-def finished(process: subprocess.Popen[str]) -> Done:
-    """Wait for a started program."""
-    out, err = process.communicate(timeout=300)
-    return Done(process.returncode, out, err)

@@ -15,13 +15,7 @@ from numpy.typing import NDArray
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.documents import Quarantined, Sidecar, Statistics
 from mbtf_core.data.folder import DataFolder
-from mbtf_core.data.lattice import Lattice
-from mbtf_core.data.schema import (
-    FORMAT_NAME,
-    MANIFEST_NAME,
-    SCHEMA_VERSION,
-    Queries,
-)
+from mbtf_core.data.schema import Queries
 from mbtf_core.data.shard_files import read_shard, write_shard
 from mbtf_core.files.atomic import Stored, checksummed, file_sha256, parse_checksummed
 from mbtf_gen.config.generator import GeneratorConfig
@@ -108,35 +102,6 @@ def write_sidecar(shard: Path, split: str, index: int, config_hash: str, **chang
     shard.with_suffix(".json").write_bytes(checksummed({**record, **changes}))
 
 
-def write_part(
-    folder: Path, split: str, index: int, arrays: dict[str, F32], config_hash: str, suffix: str = ".npz"
-) -> dict[str, Any]:
-    """Write a shard without a run; returns its entry of the manifest."""
-    name = f"{split}-{index:05d}{suffix}"
-    write_shard(folder / name, arrays)
-    write_sidecar(folder / name, split, index, config_hash)
-    return {"file": name, "rows": len(arrays["sigma"])}
-
-
-def write_manifest(
-    folder: Path, layout: str, lattice: Lattice, config_hash: str, splits: dict[str, Any], **more: Any
-) -> Path:
-    """Write the manifest of shards with these entries by split; returns the folder."""
-    manifest = {
-        "format": FORMAT_NAME,
-        "schema": SCHEMA_VERSION,
-        "config_hash": config_hash,
-        "layout": layout,
-        "levels": {"finest": lattice.finest},
-        "tile": {"aspect": lattice.aspect},
-        "geometry": None,
-        "splits": {split: {"queries": n, "shards": entries} for split, (n, entries) in splits.items()},
-        **more,
-    }
-    (folder / MANIFEST_NAME).write_bytes(checksummed(manifest))
-    return folder
-
-
 def rewrite(shard: Path, **arrays: F32) -> None:
     """Replace arrays of a shard, with a sidecar that agrees."""
     write_shard(shard, {**read_shard(shard, mapped=False), **arrays})
@@ -190,9 +155,11 @@ FOREIGN: dict[str, tuple[Callable[[Path, Path, str], object], str]] = {
 }
 
 
-def sidecar_of(shard: Path) -> Path:
-    """The JSON file beside a shard."""
-    return shard.with_suffix(".json")
+def flip(path: Path, at: int) -> None:
+    """Flip a bit of a file."""
+    content = bytearray(path.read_bytes())
+    content[at] ^= 4
+    path.write_bytes(content)
 
 
 def read_checksummed(path: Path) -> dict[str, Any]:

@@ -7,7 +7,6 @@ import zlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from hypothesis import settings
 from hypothesis import strategies as st
 
 from mbtf_core.errors import MbtfError
@@ -16,11 +15,6 @@ from mbtf_core.errors import MbtfError
 _BYTES = st.one_of(st.sampled_from([0, 1, 2, 8, 16, 127, 128, 254, 255]), st.integers(0, 255))
 # Values that replace those of a JSON document.
 _VALUES = ["null", "[]", "{}", '""', '"x"', '"../x.npz"', "-1", "0", "9" * 30, "1e300", "1.5", "true", "[[]]"]
-
-
-def examples(count: int) -> settings:
-    """Settings for that many examples; the profile of all tests makes them the same in every run."""
-    return settings(max_examples=count)
 
 
 def check_message(error: MbtfError) -> None:

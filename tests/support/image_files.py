@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .image_samples import png_chunk
+from .image_samples import packed_png
 
 
 def rng() -> np.random.Generator:
@@ -22,18 +22,12 @@ def rng() -> np.random.Generator:
 def png(
     path: Path, codes: NDArray[Any], color: int, bits: int, *, extra: tuple[tuple[bytes, bytes], ...] = ()
 ) -> Path:
-    """Write codes (H, W, C) as a PNG, from its specification; `extra` chunks stand before the pixels."""
+    """Write codes (H, W, C) as a PNG, from its specification."""
     rows, columns, _ = codes.shape
     lines = codes.astype(">u2" if bits == 16 else "u1").tobytes()
     size = len(lines) // rows
     out = b"".join(b"\0" + lines[y * size : (y + 1) * size] for y in range(rows))
-    path.write_bytes(
-        b"\x89PNG\r\n\x1a\n"
-        + png_chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, bits, color, 0, 0, 0))
-        + b"".join(png_chunk(*c) for c in extra)
-        + png_chunk(b"IDAT", zlib.compress(out))
-        + png_chunk(b"IEND", b"")
-    )
+    path.write_bytes(packed_png(columns, rows, bits, color, zlib.compress(out), *extra))
     return path
 
 

@@ -44,16 +44,19 @@ def png_chunk(kind: bytes, content: bytes) -> bytes:
     return len(content).to_bytes(4, "big") + kind + content + zlib.crc32(kind + content).to_bytes(4, "big")
 
 
-def png(columns: int, rows: int, bits: int, color: int, packed: bytes, interlace: int = 0) -> bytes:
-    """A PNG file of any header around compressed lines."""
+def packed_png(
+    columns: int, rows: int, bits: int, color: int, packed: bytes, *extra: tuple[bytes, bytes]
+) -> bytes:
+    """A PNG file around compressed lines; `extra` chunks stand before them."""
     size = columns.to_bytes(4, "big") + rows.to_bytes(4, "big")
-    head = png_chunk(b"IHDR", size + bytes([bits, color, 0, 0, interlace]))
-    return b"\x89PNG\r\n\x1a\n" + head + png_chunk(b"IDAT", packed) + png_chunk(b"IEND", b"")
+    head = png_chunk(b"IHDR", size + bytes([bits, color, 0, 0, 0]))
+    chunks = b"".join(png_chunk(*chunk) for chunk in extra)
+    return b"\x89PNG\r\n\x1a\n" + head + chunks + png_chunk(b"IDAT", packed) + png_chunk(b"IEND", b"")
 
 
 def _png16() -> bytes:
     lines = b"".join(bytes([y]) + bytes((37 * x + y) % 256 for x in range(6 * COLUMNS)) for y in range(ROWS))
-    return png(COLUMNS, ROWS, 16, 2, zlib.compress(lines))
+    return packed_png(COLUMNS, ROWS, 16, 2, zlib.compress(lines))
 
 
 def tgas() -> dict[str, bytes]:

@@ -37,9 +37,9 @@ def value(row: Any, column: Any, light: F64, view: F64) -> F64:
     return base * (slope + 0.1 * light[..., 0] * view[..., 1])[..., None]
 
 
-def image(light: F64, view: F64, rows: int = ROWS, columns: int = COLUMNS) -> F64:
+def image(light: F64, view: F64) -> F64:
     """The image (rows, columns, 3) of one light and one view."""
-    row, column = np.mgrid[:rows, :columns]
+    row, column = np.mgrid[:ROWS, :COLUMNS]
     return value(row, column, light, view)
 
 

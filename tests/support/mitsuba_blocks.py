@@ -19,11 +19,11 @@ from mbtf_gen.render.scene import CLEARANCE, LONG_SIDE  # isort: skip
 SPP = 32
 
 
-def block(grid: HeightGrid, bsdf: dict[str, Any], folder: Path, tiles: int = 5) -> dict[str, Any]:
-    """Scene entries of `tiles` × `tiles` instances of the tile, in the generator's scene units."""
+def block(grid: HeightGrid, bsdf: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Scene entries of 5 × 5 instances of the tile, in the generator's scene units."""
     unit = LONG_SIDE / max(1.0, grid.aspect)
     group = {"type": "shapegroup", "tile": height_field(grid, unit, folder, bsdf)}
-    return {"group": group, **instances(unit, grid.aspect * unit, tiles // 2, tiles // 2)}
+    return {"group": group, **instances(unit, grid.aspect * unit)}
 
 
 def instances(width: float, height: float, columns: int = 2, rows: int = 2) -> dict[str, Any]:

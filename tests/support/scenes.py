@@ -129,7 +129,7 @@ def direction(elevation: float, azimuth: float) -> NDArray[np.float64]:
     return from_angles(elevation, azimuth)
 
 
-def directional(omega_i: NDArray[np.float64], irradiance: float = 1.0) -> dict[str, Any]:
-    """Delta light from `omega_i` with an irradiance on z = 0, from above or from below."""
+def directional(omega_i: NDArray[np.float64]) -> dict[str, Any]:
+    """Delta light from `omega_i` with irradiance 1 on z = 0, from above or from below."""
     towards = [-float(c) for c in omega_i]
-    return {"type": "directional", "direction": towards, "irradiance": float(irradiance / abs(omega_i[2]))}
+    return {"type": "directional", "direction": towards, "irradiance": float(1 / abs(omega_i[2]))}

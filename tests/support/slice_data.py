@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,7 @@ from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.pytorch.networks import initialize_layers
 from mbtf_gen.sampling.query_sampler import LevelMixture, QueryPlan, slice_directions
 
-from .datasets import write_manifest, write_part
-from .fit_data import F32, Function, noisy_halves
+from .fit_data import F32, Function, Through, noisy_halves, write_splits
 
 
 def spots(u: F32, sigma: F32, omega_i: F32, omega_o: F32) -> Any:
@@ -38,37 +38,23 @@ def write_slices(
     lights: int = 10,
     test: int = 2000,
     noise: float = 0.0,
-    seed: int = 0,
-    rows: int = 40,
-    through: Callable[[F32], F32] | None = None,
-    change: Callable[[dict[str, F32]], None] | None = None,
+    through: Through | None = None,
 ) -> Path:
     """Write a data set of `lights` lights and views per texel with independent noise in both halves; returns
-    its folder. `through`: the transmittance at u, of a material with holes; `change` alters the arrays of the
-    first shard."""
-    folder.mkdir(parents=True)
-    lattice = Lattice(finest, aspect)
+    its folder."""
+    lattice, rows = Lattice(finest, aspect), 40
     directions = slice_directions("spiral", lights, 0.2)
-    plan = QueryPlan(lattice, LevelMixture(0.6, 0.4), 0.2, "slices", seed, rows, None, directions)
-    random = np.random.default_rng(seed)
-    config_hash = f"{function.__name__}-{seed}-{noise}-{lights}"
-    splits: dict[str, Any] = {}
-    for split, total in (("train", lattice.texels()), ("test", test)):
-        entries = []
-        for index, start in enumerate(range(0, total, rows)):
-            queries = plan.draw(split, index, min(rows, total - start))
-            flat, lead = queries.flat(), queries.lead
-            value = function(flat.u, flat.sigma, flat.omega_i, flat.omega_o).reshape(*lead, 3)
-            arrays: dict[str, F32] = {**vars(queries), **noisy_halves(random, value, noise)}
-            arrays["spp"] = np.full(lead, 2, np.float32)
-            if through is not None:
-                arrays["transmittance"] = through(queries.u)
-            if change is not None and (split, index) == ("train", 0):
-                change(arrays)
-            entries.append(write_part(folder, split, index, arrays, config_hash))
-        splits[split] = total, entries
-    more: dict[str, Any] = {} if through is None else {"arrays": {"transmittance": {}}}
-    return write_manifest(folder, "slices", lattice, config_hash, splits, slice_size=lights**2, **more)
+    plan = QueryPlan(lattice, LevelMixture(0.6, 0.4), 0.2, "slices", 0, rows, None, directions)
+    splits = {
+        split: [
+            vars(plan.draw(split, index, min(rows, total - rows * index)))
+            for index in range(math.ceil(total / rows))
+        ]
+        for split, total in (("train", lattice.texels()), ("test", test))
+    }
+    halves = partial(noisy_halves, np.random.default_rng(0), noise=noise)
+    name, layout = f"{function.__name__}-{noise}-{lights}", {"layout": "slices", "slice_size": lights**2}
+    return write_splits(folder, lattice, splits, function, halves, name, through=through, **layout)
 
 
 def prepared(material: NeuralMaterial, name: str, pairs: int, device: torch.device) -> Any:

@@ -177,10 +177,6 @@ class Sieve:
         return mi.Float(self.share)
 
 
-def numbers(n: int) -> Any:
-    return sequence(mi.UInt32(1), mi.UInt32(2), dr.arange(mi.UInt32, n), mi.UInt32(0))
-
-
 def test_borders_are_counted_through_holes() -> None:
     """Rays through holes cross as many borders as straight lines; the cap ends those that cross more."""
     grid, n = rocks(32), 20_000
@@ -193,7 +189,8 @@ def test_borders_are_counted_through_holes() -> None:
     ray, below = ray_of(o, d), mi.Bool(False)
 
     def run(most: int) -> tuple[Any, NDArray, NDArray]:
-        si, crossings, capped, _ = field.closest_hit(ray, mi.Bool(True), most, below, Sieve(0.15), numbers(n))
+        numbers = sequence(mi.UInt32(1), mi.UInt32(2), dr.arange(mi.UInt32, n), mi.UInt32(0))
+        si, crossings, capped, _ = field.closest_hit(ray, mi.Bool(True), most, below, Sieve(0.15), numbers)
         return si, np.array(crossings), np.array(capped)
 
     si, crossings, capped = run(1000)

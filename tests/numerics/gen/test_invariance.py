@@ -123,19 +123,6 @@ def test_the_unit_of_length_is_of_no_consequence(unit: float, monkeypatch: pytes
         assert e.lost <= 2
 
 
-def test_faint_values_are_as_exact_as_others() -> None:
-    """Albedo 1e-8: M of single reflection is linear in it, within 1e-6."""
-
-    def direct(albedo: float) -> NDArray[np.float64]:
-        q = queries(positions(), 0.01, LIGHT, VIEW, N)
-        e = estimate(RELIEF, lambert(albedo), LightKernel(0.0), q, 4, transport=DIRECT)
-        return e.value_a[:, 0].astype(np.float64)
-
-    faint, full = direct(1e-8), direct(1.0)
-    np.testing.assert_allclose(faint, 1e-8 * full, rtol=1e-6, atol=1e-15)
-    assert 1e-10 < faint.max() < 1e-7
-
-
 def test_huge_values_are_exact_and_survive_the_format(tmp_path: Path) -> None:
     """Towards a light 1e-6 above the horizon, albedo/π · (n·ω_i)/ω_i,z exceeds half precision."""
     slope = {"type": "bitmap", "bitmap": mi.Bitmap(np.full((2, 2, 3), -1.0, np.float32)), "raw": True}

@@ -56,20 +56,14 @@ def test_a_mesh_of_a_shape_looks_like_the_shape(shape: Shape, around: int, job: 
     )
     mesh = written(tmp_path / "shape.obj", p, uv * (1.0, -1.0) + (0.0, 1.0), faces)
     across, light = 1.25 * around / np.pi, from_angles(35.0, -50.0)
-    cameras = [
-        Camera(25.0, -90.0, across * r, rows=SIZE, columns=SIZE) for r in (1.0, mesh.radius / chart_radius(p))
-    ]
+    scale = mesh.radius / float(np.linalg.norm(p, axis=1).max())
+    cameras = [Camera(25.0, -90.0, across * r, rows=SIZE, columns=SIZE) for r in (1.0, scale)]
     expected, found = (
         render_shape(job, surface.mesh, camera, light, SPP, seed, max_depth=2)
         for seed, (surface, camera) in enumerate(zip((chart, mesh), cameras, strict=True))
     )
     mean, square = differences(halves(found), halves(expected))
     assert agree(mean, square), (mean, square)
-
-
-def chart_radius(position: F64) -> float:
-    """Largest distance from the origin."""
-    return float(np.linalg.norm(position, axis=1).max())
 
 
 def test_a_mirrored_chart_gives_the_mirrored_picture(job: Job, tmp_path: Path) -> None:

@@ -73,18 +73,14 @@ def test_the_closed_form_is_the_color_over_pi() -> None:
     np.testing.assert_allclose(traced.value_a, found.value_a, rtol=1e-5)
 
 
-@pytest.fixture
-def config(tmp_path: Path) -> GeneratorConfig:
+def test_resumed_and_sliced_runs_follow_the_plan_of_the_manifest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The plan of the manifest applies, even where another machine would choose another one."""
     np.save(tmp_path / "height.npy", noise(4, 8))
     queries = {"train": "100", "test": "30", "spp": 2, "test_spp": 4}
     rest = {"queries": queries, "output": {"shard_queries": 40}, "effects": {"mode": "all"}}
-    return GeneratorConfig.model_validate({"material": str(tmp_path / "height.npy"), **rest})
-
-
-def test_resumed_and_sliced_runs_follow_the_plan_of_the_manifest(
-    config: GeneratorConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The plan of the manifest applies, even where another machine would choose another one."""
+    config = GeneratorConfig.model_validate({"material": str(tmp_path / "height.npy"), **rest})
     plans: list[EffectsPlan] = []
     monkeypatch.setattr(generation, "build_estimator", lambda job, plan: plans.append(plan) or Formula())
     out = tmp_path / "out"

@@ -87,10 +87,6 @@ def lattice() -> Any:
     return mi.Point2f((np.stack([x, y]).astype(np.float32) + 0.5) / CELLS)
 
 
-def covariance(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.cov(points.T), np.float64)
-
-
 @pytest.mark.parametrize("aspect", ASPECTS)
 def test_query_rays_pass_the_reference_plane_at_their_point(aspect: float) -> None:
     unit = LONG_SIDE / max(1.0, aspect)
@@ -121,7 +117,7 @@ def test_camera_rays_fill_the_pixel_that_its_query_states(aspect: float) -> None
     middle = u.mean(axis=0) - q.u.reshape(-1, 2)[pixel]
     np.testing.assert_allclose(middle, np.round(middle), atol=2e-4)
     # σ of the query is the geometric mean of the two radii.
-    spread = covariance(u * (1.0, aspect))
+    spread = np.cov((u * (1.0, aspect)).T)
     assert np.linalg.det(spread) ** 0.25 == pytest.approx(q.sigma.ravel()[pixel], rel=2e-2)
     ray = source.ray(None, point)
     o, d = np.array(ray.o, np.float64).T, np.array(ray.d, np.float64).T

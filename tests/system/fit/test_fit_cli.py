@@ -10,7 +10,7 @@ import pytest
 from support.command_lines import call
 from support.commands import run_all
 from support.fit_data import parallax, write_data
-from support.measured_files import photographs, zipped
+from support.measured_files import photographs, write_folder
 
 QUICK = ("--steps", "5", "--batch", "500")
 
@@ -62,18 +62,12 @@ def test_a_finished_fit_is_not_trained_again(shards: Path, material: Path) -> No
 SMALL = "--size 64 --view 60,0 --light 60,0 --tiles-across 1"
 
 
-@pytest.fixture(scope="module")
-def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("measured")
-    (folder / "felt.zip").write_bytes(zipped(photographs()))
-    command = "import felt.zip --cosine included --scale 0.3183 --queries 20/texel -o felt"
-    (done,) = run_all([command.split()], folder)
+def test_from_data_to_pictures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_folder(tmp_path / "photographs", photographs())
+    command = "import photographs --cosine included --scale 0.3183 --queries 20/texel -o felt"
+    (done,) = run_all([command.split()], tmp_path)
     assert done.code == 0, done.err
-    return folder
-
-
-def test_from_data_to_pictures(work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(work)
+    monkeypatch.chdir(tmp_path)
     fit = call(["mbtf-fit", "felt", "-o", "material", "--steps", "30", "--batch", "500", "--json"])
     assert fit.code == 0, fit.err
     assert "felt -> material: neumip+" in fit.err
@@ -86,6 +80,6 @@ def test_from_data_to_pictures(work: Path, monkeypatch: pytest.MonkeyPatch) -> N
         assert done.code == 0, done.err
         assert "these errors include the noise of the data" in done.out
     # Mitsuba looks for relative paths in the folder where it was first loaded.
-    drawn = call(["mbtf-fit", "preview", str(work / "material"), "-o", "pictures", *SMALL.split()])
+    drawn = call(["mbtf-fit", "preview", str(tmp_path / "material"), "-o", "pictures", *SMALL.split()])
     assert drawn.code == 0, drawn.err
-    assert (work / "pictures/sheet.png").is_file()
+    assert (tmp_path / "pictures/sheet.png").is_file()

@@ -71,18 +71,12 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def materials(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("fits") / "materials"
-    narrow = ("--set", "network.width=16")
-    words = ["--many", str(data / "a"), str(data / "b"), "--shared-decoder", "-o", str(out)]
+def test_a_fit_takes_model_and_network_from_the_folder(data: Path, tmp_path: Path) -> None:
+    materials, narrow = tmp_path / "materials", ("--set", "network.width=16")
+    words = ["--many", str(data / "a"), str(data / "b"), "--shared-decoder", "-o", str(materials)]
     done = call(["mbtf-fit", *words, *QUICK, *narrow])
     assert done.code == 0, done.err
     assert [line.split()[0] for line in done.out.splitlines()] == ["material", "a", "b"]
-    return out
-
-
-def test_a_fit_takes_model_and_network_from_the_folder(materials: Path, data: Path, tmp_path: Path) -> None:
     wanted = network_tensors(Material.load(materials / "a").model)
     # A preset has another network.
     words = ["--decoder", str(materials / "a"), "-o", str(tmp_path / "m"), "--quality", "draft", *QUICK]

@@ -1,4 +1,4 @@
-"""Whole runs of ``mbtf-gen``: forms of the command, slices, layouts, formats, pictures."""
+"""Whole runs of ``mbtf-gen``: forms of the command, pictures."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import RunPython
 from numpy.typing import NDArray
 from PIL import Image
-from support.commands import Done, finished, run_all, run_named, start
+from support.commands import Done, run_named
 from support.datasets import edit
 from support.small_runs import write_maps
 
@@ -23,7 +24,6 @@ Arrays = dict[str, NDArray[np.float32]]
 # 16 texels across, 8 down.
 MAP = (8, 16)
 SMALL = "--queries 16/texel --test-queries 200 --test-spp 8 --set output.shard_queries=64"
-COMMAND = f"maps {SMALL}".split()
 PICTURES = "reference maps -o pictures --view 50,20 --light 60,80 --tiles-across 0.5,2 --size 24"
 
 
@@ -54,12 +54,13 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def whole(work: Path) -> Path:
+def whole(work: Path, run_python: RunPython) -> Path:
     """An undisturbed run, made by the program itself."""
-    done = finished(start([*COMMAND, "-o", "whole", "--json"], work))
-    assert done.code == 0, done.err
+    out = ("-o", str(work / "whole"), "--json")
+    done = run_python("-m", "mbtf_gen", str(work / "maps"), *SMALL.split(), *out)
+    assert done.returncode == 0, done.stderr
     # Standard output is one JSON object and nothing else.
-    summary = json.loads(done.out)
+    summary = json.loads(done.stdout)
     assert summary["complete"] is True
     assert summary["queries"] == 16 * 8 * 16 + 200
     assert summary["paths"] == 16 * 8 * 16 * 4 + 200 * 8
@@ -79,17 +80,6 @@ def test_the_data_set_is_intact_and_sane(whole: Path) -> None:
         assert np.mean(arrays["value_a"] != arrays["value_b"]) > 0.3
 
 
-def test_slices_written_at_once_and_merged_are_the_whole(work: Path, whole: Path) -> None:
-    processes = [start([*COMMAND, "-o", "sliced", "--slice", f"{i}/3"], work) for i in (1, 2, 3)]
-    done = [finished(p) for p in processes]
-    assert [d.code for d in done] == [0, 0, 0], done
-    (merged,) = run_all([["merge", "sliced", "--json"]], work)
-    assert merged.code == 0, merged.err
-    assert json.loads(merged.out)["complete"] is True
-    assert verify(work / "sliced") == []
-    assert equal(work / "sliced", whole)
-
-
 @pytest.fixture(scope="module")
 def batch(work: Path, whole: Path) -> dict[str, Done]:
     """Many commands in one process."""
@@ -97,7 +87,6 @@ def batch(work: Path, whole: Path) -> dict[str, Done]:
     (work / "unmerged/test-00001.npz").unlink()
     edit(work / "unmerged/manifest.json", lambda manifest: manifest.update(complete=False))
     few = "--queries 2/texel --test-queries 100 --spp 2 --test-spp 2 --seed 3 --json"
-    image = f"{few} --layout image --set output.shard_queries=256"
     lines = {
         "unmerged": "merge unmerged",
         "file": f"maps/height.npy {few} -o file",
@@ -105,9 +94,6 @@ def batch(work: Path, whole: Path) -> dict[str, Done]:
         "yaml": f"material.yaml {few} -o yaml",
         "set": "maps -o set --json --set queries.train=2/texel --set queries.test=100 --set queries.spp=2 "
         "--set queries.test_spp=2 --set seed=3",
-        "plain exr": f"maps {few} --format exr -o plain-exr",
-        "images": f"maps {image} -o images",
-        "image exr": f"maps {image} --format exr -o image-exr",
         "reference": f"{PICTURES} --json --spp 4",
     }
     return run_named(lines, work)
@@ -128,14 +114,6 @@ def test_every_form_of_the_command_makes_the_same_data(batch: dict[str, Done], w
     assert np.array_equal(gray["u"], colored["u"])
     assert np.ptp(gray["value_a"], axis=-1).max() < 1e-6
     assert np.ptp(colored["value_a"], axis=-1).max() > 0.01
-
-
-def test_formats_hold_the_same_numbers(batch: dict[str, Done], work: Path) -> None:
-    for npz, exr in (("first", "plain-exr"), ("images", "image-exr")):
-        assert equal(work / npz, work / exr)
-        assert verify(work / exr) == []
-        assert not list((work / exr).glob("*.npz"))
-    assert batch["plain exr"].result()["mean_value"] == batch["flags first"].result()["mean_value"]
 
 
 def test_reference_writes_pictures_for_people_and_programs(batch: dict[str, Done], work: Path) -> None:

@@ -5,14 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from support.commands import Done, run_named
+from support.commands import run_all
 
 # Quadrants of the map: top left, top right, bottom left, bottom right.
 QUADRANTS = {"red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "white": (1, 1, 1)}
-FAST = "--size 96 --spp 4"
+COMMAND = "preview maps -o tilted --tiles 1 --size 96 --spp 4"
 
 
 def write_inputs(folder: Path) -> None:
@@ -26,26 +25,6 @@ def write_inputs(folder: Path) -> None:
         height[part] = z
     Image.fromarray(color).save(folder / "maps/base_color.png")
     np.save(folder / "maps/height.npy", height)
-    np.save(folder / "flat.npy", np.zeros((8, 8)))
-
-
-@pytest.fixture(scope="module")
-def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("preview")
-    write_inputs(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def batch(work: Path) -> dict[str, Done]:
-    lines = {
-        "tilted": f"preview maps -o tilted --tiles 1 {FAST} --json",
-    }
-    return run_named(lines, work)
-
-
-def pixels(path: Path) -> NDArray[np.float64]:
-    return np.asarray(Image.open(path).convert("RGB"), np.float64) / 255
 
 
 def quadrant(picture: NDArray[np.float64]) -> NDArray[np.intp]:
@@ -56,9 +35,12 @@ def quadrant(picture: NDArray[np.float64]) -> NDArray[np.intp]:
     return np.where(distance.min(axis=-1) < 0.6, distance.argmin(axis=-1), -1)
 
 
-def test_colors_lie_in_the_quadrants_of_the_map(batch: dict[str, Done], work: Path) -> None:
+def test_colors_lie_in_the_quadrants_of_the_map(tmp_path: Path) -> None:
     """The camera stands towards -v: the map's first row is far, its first column left."""
-    picture = quadrant(pixels(work / "tilted" / "beauty.png"))
+    write_inputs(tmp_path)
+    (done,) = run_all([COMMAND.split()], tmp_path)
+    assert done.code == 0, done.err
+    picture = quadrant(np.asarray(Image.open(tmp_path / "tilted/beauty.png").convert("RGB")) / 255)
     # Positions close to the picture's middle, where the tile's middle is.
     for number, (down, right) in enumerate([(-5, -12), (-5, 12), (6, -12), (6, 12)]):
         part = picture[36 + down - 2 : 36 + down + 3, 48 + right - 4 : 48 + right + 5]

@@ -1,20 +1,47 @@
-"""``examples/slurm_array.sh`` on a real SLURM: the bytes of a plain run."""
+"""``examples/slurm_array.sh`` on a real SLURM: the bytes of a plain run. It needs root and Debian's packages
+slurm-wlm and munge."""
 
 from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from support.paths import ROOT
-from support.slurm import slurm_node
 from support.small_runs import contents, write_maps
 
+SLURM = ROOT / "tests" / "system" / "slurm"
 OPTIONS = "--queries 16/texel --test-queries 200 --test-spp 8 --set output.shard_queries=128"
+
+
+@contextmanager
+def slurm_node(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A SLURM of one node, which the environment names, for a block; skips where it cannot be."""
+    missing = [name for name in ("slurmctld", "slurmd", "munged") if shutil.which(name) is None]
+    if missing:
+        pytest.skip(f"no {missing[0]}; to enable, on Debian: apt install slurm-wlm munge")
+    if os.geteuid() != 0:
+        pytest.skip("not root, as which SLURM runs; to enable: run the tests as root")
+    # Names of sockets are short.
+    folder = Path(tempfile.mkdtemp(prefix="slurm-", dir="/tmp"))
+    try:
+        done = subprocess.run(
+            [SLURM / "start.sh", folder, "2"], capture_output=True, text=True, timeout=60, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        monkeypatch.setenv("SLURM_CONF", str(folder / "slurm.conf"))
+        yield
+    finally:
+        subprocess.run([SLURM / "stop.sh", folder], capture_output=True, timeout=60, check=False)
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def install_programs(folder: Path) -> None:

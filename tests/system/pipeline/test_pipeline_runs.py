@@ -6,14 +6,13 @@ import base64
 import json
 import math
 import re
-import subprocess
-import sys
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from conftest import RunPython
 from support.pages import loads
 from support.paths import ROOT
 
@@ -32,12 +31,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def first(folder: Path) -> dict[str, Any]:
+def first(folder: Path, run_python: RunPython) -> dict[str, Any]:
     """Output of the first run in a process of its own."""
-    command = [sys.executable, "-m", "mbtf_pipeline", "run", str(RECIPE), "-o", str(folder), "--json", "-q"]
-    done = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, timeout=300, stdin=subprocess.DEVNULL, check=False
-    )
+    done = run_python("-m", "mbtf_pipeline", "run", str(RECIPE), "-o", str(folder), "--json", "-q")
     assert done.returncode == 0, done.stderr
     out: dict[str, Any] = json.loads(done.stdout)
     return out

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.fuzzing import damaged, examples, loads_or_refuses
+from support.fuzzing import damaged, loads_or_refuses
 
 from mbtf_core.config.settings import resolve
 from mbtf_core.config.yaml_file import read_yaml
@@ -119,7 +119,7 @@ def odd(draw: st.DrawFn, text: str) -> str:
 
 @pytest.mark.parametrize("kind", DOCUMENTS)
 @given(data=st.data())
-@examples(120)
+@settings(max_examples=120)
 def test_odd_words(kind: str, data: st.DataObject, folder: Path) -> None:
     text, load = DOCUMENTS[kind]
     path = folder / f"{kind}.yaml"
@@ -128,7 +128,7 @@ def test_odd_words(kind: str, data: st.DataObject, folder: Path) -> None:
 
 
 @given(data=st.data())
-@examples(120)
+@settings(max_examples=120)
 def test_damaged_bytes(data: st.DataObject, folder: Path) -> None:
     kind, content = data.draw(damaged({k: text.encode() for k, (text, _) in DOCUMENTS.items()}))
     path = folder / f"{kind}.yaml"

@@ -4,17 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from mbtf_core import height_planes
 from mbtf_core.height_planes import node_table
 
 SHAPES = [(1, 1), (1, 7), (2, 2), (5, 3), (8, 8), (13, 32), (33, 9)]
-
-
-def heights(shape: tuple[int, int]) -> NDArray[np.float64]:
-    rng = np.random.default_rng(shape[0])
-    return np.where(rng.random(shape) < 0.2, -3.0, 0.0) + rng.random(shape)
 
 
 @pytest.mark.parametrize("below", [False, True])
@@ -23,7 +17,8 @@ def test_no_vertex_pierces_a_plane(
     shape: tuple[int, int], below: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(height_planes, "_PASS_NUMBERS", 100)
-    z = heights(shape)
+    rng = np.random.default_rng(shape[0])
+    z = np.where(rng.random(shape) < 0.2, -3.0, 0.0) + rng.random(shape)
     table = node_table(z, below)
     rows, columns = shape
     columns_log2, rows_log2 = ((n - 1).bit_length() for n in (columns, rows))

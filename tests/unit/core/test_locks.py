@@ -31,10 +31,6 @@ def plant(shard: Path, text: str, age: float = 0.0) -> Path:
     return lock
 
 
-def owner(host: str, process: int) -> str:
-    return json.dumps({"host": host, "process": process, "since": 0})
-
-
 @pytest.fixture
 def shard(tmp_path: Path) -> Path:
     return tmp_path / "train-00003.npz"
@@ -94,7 +90,7 @@ def test_the_lock_of_a_killed_process_is_taken_over_at_once(shard: Path) -> None
 
 
 def test_of_many_that_take_over_at_once_one_gets_it(shard: Path) -> None:
-    plant(shard, owner(socket.gethostname(), 1))
+    plant(shard, json.dumps({"host": socket.gethostname(), "process": 1, "since": 0}))
     inside, most, gate = 0, 0, threading.Barrier(8)
     count = threading.Lock()
 

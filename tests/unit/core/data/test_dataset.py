@@ -12,15 +12,11 @@ from support.datasets import FOREIGN, NOISE, formula, rewrite, write_dataset
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.schema import Queries
-from mbtf_core.data.shard_files import Arrays, read_shard
+from mbtf_core.data.shard_files import read_shard
 from mbtf_core.errors import InputError
 from mbtf_core.stats import pooled_error
 
 OUTPUT = {"shard_queries": 64}
-
-
-def queries_of(arrays: Arrays) -> Queries:
-    return Queries(arrays["u"], arrays["sigma"], arrays["omega_i"], arrays["omega_o"])
 
 
 @pytest.mark.parametrize("array_format", ["npz", "exr"])
@@ -34,7 +30,8 @@ def test_shuffled_layout(tmp_path: Path, array_format: str) -> None:
     arrays = data.load("train")
     assert {a.shape[0] for a in arrays.values()} == {150}
     test = data.load("test")
-    error = (test["value_a"] + test["value_b"]) / 2 - formula(queries_of(test))
+    queries = Queries(test["u"], test["sigma"], test["omega_i"], test["omega_o"])
+    error = (test["value_a"] + test["value_b"]) / 2 - formula(queries)
     expected = pooled_error(test["value_a"], test["value_b"]).value
     assert np.sqrt(np.mean(error**2)) == pytest.approx(expected, rel=0.1)
     assert np.abs(error).max() < 6 * NOISE

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.datasets import edit, write_dataset
-from support.fuzzing import altered, damaged, examples, loads_or_refuses
+from support.fuzzing import altered, damaged, loads_or_refuses
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.schema import MANIFEST_NAME
@@ -54,7 +54,7 @@ def samples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
 
 
 @given(data=st.data())
-@examples(250)
+@settings(max_examples=250)
 def test_a_damaged_shard(data: st.DataObject, samples: dict[str, bytes], folder: Path) -> None:
     name, content = data.draw(damaged(samples))
     path = folder / name
@@ -81,7 +81,7 @@ def read_all(folder: Path) -> None:
 
 
 @given(data=st.data())
-@examples(150)
+@settings(max_examples=150)
 def test_an_altered_manifest_or_sidecar(data: st.DataObject, whole: Path) -> None:
     manifest = (whole / MANIFEST_NAME).read_text()
     path = whole / data.draw(st.sampled_from([MANIFEST_NAME, MANIFEST_NAME, "train-00001.json"]))

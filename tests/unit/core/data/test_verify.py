@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.datasets import edit, sidecar_of, write_dataset
+from support.datasets import edit, write_dataset
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.documents import finished_record
@@ -61,6 +61,10 @@ def foreign(folder: Path) -> list[str]:
     return foreign_files(
         DataFolder.open(folder), [e for split in dataset.splits for e in dataset.entries(split)]
     )
+
+
+def sidecar_of(shard: Path) -> Path:
+    return shard.with_suffix(".json")
 
 
 def test_every_flipped_byte_is_found(copy: Path) -> None:

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
-from support.fuzzing import damaged, examples, loads_or_refuses, with_checksums
-from support.image_samples import bmps, exrs, jpgs, npys, png, pngs, tgas, tiffs
+from support.fuzzing import damaged, loads_or_refuses, with_checksums
+from support.image_samples import bmps, exrs, jpgs, npys, packed_png, pngs, tgas, tiffs
 
 from mbtf_core.images.read import read_image
 
@@ -49,7 +49,7 @@ def read(folder: Path, name: str, content: bytes) -> None:
 
 @pytest.mark.parametrize("kind", ["png", "jpg", "tif", "npy", "exr", "tga", "bmp"])
 @given(data=st.data())
-@examples(200)
+@settings(max_examples=200)
 def test_a_damaged_image(
     kind: str, data: st.DataObject, samples: dict[str, dict[str, bytes]], folder: Path
 ) -> None:
@@ -152,8 +152,8 @@ def write_claims(folder: Path, beside: Path) -> dict[str, str]:
     lines = zlib.compress(bytes(100_000))
     huge = struct.pack("<4i", 0, 0, SIDE - 1, SIDE - 1)
     claims: dict[str, tuple[bytes, str]] = {
-        "gray.png": (png(SIDE, SIDE, 8, 0, lines), "claims 60000 x 60000 pixels"),
-        "cap.png": (png(11000, 11000, 8, 6, lines), "cannot hold 11000 x 11000 pixels"),
+        "gray.png": (packed_png(SIDE, SIDE, 8, 0, lines), "claims 60000 x 60000 pixels"),
+        "cap.png": (packed_png(11000, 11000, 8, 6, lines), "cannot hold 11000 x 11000 pixels"),
         "side.jpg": (_jpg(SIDE), "claims 60000 x 60000 pixels"),
         "side.tif": (_tiff(SIDE), "claims 60000 x 60000 pixels"),
         "cap.tif": (_tiff(11000), "cannot hold 11000 x 11000 pixels"),

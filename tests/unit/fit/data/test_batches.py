@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import torch
 from support.datasets import edit, read_checksummed, rewrite, write_sidecar
-from support.fit_data import constant, parallax, write_data
-from support.image_data import write_images
+from support.fit_data import constant, parallax, write_data, write_images
 from support.slice_data import write_slices
 from torch.utils.data import DataLoader
 

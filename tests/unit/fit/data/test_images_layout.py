@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from support.fit_data import constant, parallax, random_queries, write_data
-from support.image_data import random_images, write_images
+from support.fit_data import constant, parallax, random_images, random_queries, write_data, write_images
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice, sigma_of_level
@@ -27,11 +26,6 @@ HELD_OUT = HeldOutSection(queries=0.1, radius=0.3)
 
 def partition(folder: Path, held_out: HeldOutSection = HELD_OUT, seed: int = 0) -> Partition:
     return load_training(Dataset.open(folder), held_out, seed)
-
-
-def images_of(part: Partition) -> TrainingImages:
-    assert isinstance(part.training, TrainingImages)
-    return part.training
 
 
 def numbered(q: Mapping[str, np.ndarray], *shape: np.ndarray) -> TrainingImages:
@@ -54,7 +48,8 @@ def test_whole_images_are_held_out(tmp_path: Path) -> None:
     folder = write_images(tmp_path / "d", parallax, train=60)
     many = HeldOutSection(queries=0.4, radius=0.3)
     part = partition(folder, many)
-    training = images_of(part)
+    training = part.training
+    assert isinstance(training, TrainingImages)
     for q in (training, part.held_out_queries):
         for omega in (q.omega_i, q.omega_o):
             assert not in_region(many, np.asarray(omega)).any()

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from support.datasets import rewrite
 from support.slice_data import write_slices
 
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.data.shard_files import read_shard
 from mbtf_core.errors import InputError
 from mbtf_fit.data.layouts import DECODED, SharedSlices, TrainingSlices
 from mbtf_fit.data.loader import load_training
@@ -95,10 +97,9 @@ def test_slices_are_queries_in_random_order(tmp_path: Path) -> None:
     ],
 )
 def test_damaged_slices_are_refused(tmp_path: Path, name: str, changed: Any, message: str) -> None:
-    def change(arrays: Any) -> None:
-        arrays[name] = arrays[name].copy()
-        arrays[name][1] = changed(arrays[name])
-
-    data = Dataset.open(write_slices(tmp_path / "data", change=change))
+    shards = write_slices(tmp_path / "data")
+    array = read_shard(shards / "train-00000.npz", mapped=False)[name].copy()
+    array[1] = changed(array)
+    rewrite(shards / "train-00000.npz", **{name: array})
     with pytest.raises(InputError, match=message):
-        load_training(data, HeldOutSection(), 0)
+        load_training(Dataset.open(shards), HeldOutSection(), 0)

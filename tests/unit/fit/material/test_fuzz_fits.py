@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.torch import load, save
 from support.fit_data import constant, write_data
-from support.fuzzing import altered, damaged, examples, loads_or_refuses
+from support.fuzzing import altered, damaged, loads_or_refuses
 
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import file_sha256
@@ -59,7 +59,7 @@ def write(folder: Path, whole: Path, description: str | None, weights: bytes | N
 
 
 @given(data=st.data())
-@examples(40)
+@settings(max_examples=40)
 def test_an_altered_description(data: st.DataObject, whole: Path, folder: Path) -> None:
     write(folder, whole, data.draw(altered(described(whole))), None)
     loads_or_refuses(lambda: use(folder))
@@ -73,7 +73,7 @@ def described(whole: Path) -> str:
 
 
 @given(data=st.data())
-@examples(40)
+@settings(max_examples=40)
 def test_damaged_weights(data: st.DataObject, whole: Path, folder: Path) -> None:
     _, content = data.draw(damaged({WEIGHTS: (whole / WEIGHTS).read_bytes()}))
     write(folder, whole, None, content)

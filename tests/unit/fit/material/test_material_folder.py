@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.numpy import load_file
-from support.datasets import edit
+from support.datasets import edit, flip
 from support.fit_data import constant, parallax, write_data
 
 import mbtf_fit.material.material
@@ -113,9 +113,7 @@ def test_damaged_materials_are_refused(fitted: FitResult, tmp_path: Path) -> Non
     for name in ("material.json", "weights.safetensors"):
         (tmp_path / name).write_bytes((fitted.folder / name).read_bytes())
     weights = tmp_path / "weights.safetensors"
-    content = bytearray(weights.read_bytes())
-    content[-1] ^= 1
-    weights.write_bytes(content)
+    flip(weights, -1)
     with pytest.raises(InputError, match=r"is damaged, .*SHA-256 is not "):
         Material.load(tmp_path)
     weights.unlink()

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support.fit_data import constant, flat_geometry, random_queries, write_data
-from support.image_data import write_images
+from support.fit_data import constant, random_queries, write_data, write_images
+from support.known_surfaces import geometry
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.lattice import Lattice
@@ -65,10 +64,9 @@ def test_a_known_transmittance_is_found(tmp_path: Path) -> None:
 def test_holes_are_found_at_their_depths(tmp_path: Path) -> None:
     """Two sheets with holes at depths between those of the layers, seen through one another."""
     lattice, aspect = Lattice(4, 0.5), 0.5
-    surface = flat_geometry(lattice)
-    heights = np.zeros_like(surface.heights)
+    heights = np.zeros((8, 8), np.float32)
     heights[2:] = -0.2
-    geometry = replace(surface, heights=heights)
+    surface = geometry(lattice, heights)
 
     def sheets(u: np.ndarray, sigma: np.ndarray, omega_o: np.ndarray) -> np.ndarray:
         fade, total = np.exp(-2 * (np.pi * sigma) ** 2), np.zeros(len(u))
@@ -79,7 +77,7 @@ def test_holes_are_found_at_their_depths(tmp_path: Path) -> None:
 
     data = Dataset.open(
         write_data(
-            tmp_path, constant(0.2), train=120_000, finest=4, aspect=aspect, through=sheets, geometry=geometry
+            tmp_path, constant(0.2), train=120_000, finest=4, aspect=aspect, through=sheets, geometry=surface
         )
     )
     model = fit_transmittance(data, chosen(data))

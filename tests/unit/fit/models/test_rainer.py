@@ -174,10 +174,7 @@ def test_a_fit_is_known_by_what_other_data_hold(tmp_path: Path) -> None:
 
 def test_slices_of_cloth_have_a_transmittance(tmp_path: Path) -> None:
     """The transmittance is fitted to all texels, with the finest footprint."""
-
-    shards = write_slices(
-        tmp_path / "data", through=lambda u: np.where(u[..., 0] < 0.5, 0.8, 0.2).astype(np.float32)
-    )
+    shards = write_slices(tmp_path / "data", through=lambda u, s, o: np.where(u[:, 0] < 0.5, 0.8, 0.2))
     material = fit(config("rainer2019", steps=3), shards, tmp_path / "fit").material
     assert material.transmittance is not None
     u = np.array([[0.25, 0.5], [0.75, 0.5]])

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import measured_files as files
-from support.fuzzing import damaged, examples, loads_or_refuses
+from support.fuzzing import damaged, loads_or_refuses
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_gen.config.exchange import ImportConfig
@@ -59,7 +59,7 @@ def test_sound_files_are_imported(name: str, samples: dict[str, bytes], folder: 
 
 
 @given(data=st.data())
-@examples(120)
+@settings(max_examples=120)
 def test_damaged_files(data: st.DataObject, samples: dict[str, bytes], folder: Path) -> None:
     _, content = data.draw(damaged(samples))
     found = loads_or_refuses(lambda: imported(content, folder))

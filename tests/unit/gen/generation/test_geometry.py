@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.datasets import write_dataset
+from support.datasets import flip, write_dataset
 from support.height_maps import slope_normals
 
 from mbtf_core.data.geometry import (
@@ -256,8 +256,6 @@ def test_a_data_set_reads_its_own_geometry(tmp_path: Path) -> None:
     np.testing.assert_array_equal(geometry.heights, (heights - heights.max()).astype(np.float32))
     again = write_dataset(tmp_path / "again", queries={"train": "60", "test": "20"}, seed=5)
     assert again.folder.read("geometry.exr") == path.read_bytes()
-    content = bytearray(path.read_bytes())
-    content[-1] ^= 1
-    path.write_bytes(content)
+    flip(path, -1)
     with pytest.raises(InputError, match="has changed since it was written"):
         data.geometry()

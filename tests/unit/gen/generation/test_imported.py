@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.measured_data import Images, Listed, known
+from numpy.typing import NDArray
 from support.paths import ROOT
 
 from mbtf_core.data.dataset import Dataset
@@ -22,9 +22,57 @@ from mbtf_gen.config.exchange import ImportConfig
 from mbtf_gen.generation import imported
 from mbtf_gen.generation.imported import Import, import_measured
 from mbtf_gen.generation.repair import repair
+from mbtf_gen.measured.interface import F32
+from mbtf_gen.sampling.query_sampler import direction_pairs, slice_directions
 from mbtf_pipeline.compare.metrics import dataset_errors
 
 Open = Callable[..., Import]
+
+
+def known(u: NDArray[np.floating], omega_i: F32, omega_o: F32) -> F32:
+    """M (n, 3) that tells positions, light, view and colors apart; positive."""
+    value = 0.3 + 0.1 * np.sin(2 * np.pi * u[:, 0]) + 0.05 * np.cos(2 * np.pi * u[:, 1])
+    value = value + 0.1 * omega_i[:, 0] + 0.05 * omega_o[:, 1]
+    return np.asarray(value[:, None] * np.array([1.0, 0.7, 0.4]), np.float32)
+
+
+class Images:
+    """Images of :func:`known`, times the cosine of the light."""
+
+    at_once = 700
+
+    def __init__(self, lights: int = 8) -> None:
+        self.rows, self.columns = 6, 12
+        self.light, self.view = direction_pairs(slice_directions("spiral", lights, 0.05))
+        self.left_out = 3
+        self.cosine: bool | None = True
+        self.calls = 0
+
+    def values(self, pair: NDArray[np.int64], texel: NDArray[np.int64]) -> F32:
+        self.calls += 1
+        j, i = np.divmod(texel, self.columns)
+        u = np.stack([(i + 0.5) / self.columns, 1.0 - (j + 0.5) / self.rows], -1)
+        return known(u, self.light[pair], self.view[pair]) * self.light[pair, 2:]
+
+
+class Listed:
+    """Random queries of :func:`known`."""
+
+    count = 1000
+
+    def __init__(self) -> None:
+        random, count = np.random.default_rng(0), self.count
+        omega = slice_directions("spiral", 50, 0.2)
+        self.arrays = {
+            "u": random.random((count, 2), np.float32),
+            "sigma": np.full(count, 0.5 / 16, np.float32),
+            "omega_i": omega[random.integers(50, size=count)],
+            "omega_o": omega[random.integers(50, size=count)],
+        }
+        self.arrays["value"] = known(self.arrays["u"], self.arrays["omega_i"], self.arrays["omega_o"])
+
+    def read(self, start: int, stop: int) -> Any:
+        return {name: a[start:stop].copy() for name, a in self.arrays.items()}
 
 
 @pytest.fixture

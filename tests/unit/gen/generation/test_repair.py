@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.datasets import edit
+from support.datasets import edit, flip
 from support.small_runs import command, contents, generate, noisy_plane
 
 from mbtf_core.app.console import run
@@ -36,12 +36,6 @@ def out(tmp_path: Path) -> Path:
     assert generate(command(tmp_path, tmp_path / "out")) == 0
     shutil.copytree(tmp_path / "out", tmp_path / "whole")
     return tmp_path / "out"
-
-
-def flip(path: Path, at: int) -> None:
-    content = bytearray(path.read_bytes())
-    content[at] ^= 4
-    path.write_bytes(content)
 
 
 def moments(folder: Path) -> dict[str, int]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.datasets import flip
 from support.object_stores import downloaded, memory_store
 from support.small_runs import command, contents, generate, noisy_plane
 
@@ -230,9 +231,7 @@ def left(tmp_path: Path, url: str, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_damaged_leftovers_are_rendered_again(tmp_path: Path, url: str, left: Path) -> None:
-    content = bytearray(left.read_bytes())
-    content[-100] ^= 1
-    left.write_bytes(bytes(content))
+    flip(left, -100)
     assert generate(command_at(tmp_path, url)) == 0
     assert generate(command(tmp_path, tmp_path / "local")) == 0
     assert contents(downloaded(url, tmp_path / "copy")) == contents(tmp_path / "local")

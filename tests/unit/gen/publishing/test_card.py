@@ -18,11 +18,6 @@ from mbtf_gen.publishing.facts import Facts
 HOSTILE = '<script>alert("1")</script> ![x](https://example.org/p.png) | `*_'
 
 
-def page(card: Path) -> str:
-    text = (card / "README.md").read_text().split("---\n", 2)[2]
-    return MarkdownIt("commonmark", {"html": True}).enable("table").render(text)
-
-
 def run_block(block: str, card: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.chdir(card)
     names: dict[str, Any] = {}
@@ -72,7 +67,8 @@ def test_names_are_shown_and_nothing_is_loaded_from_elsewhere(tmp_path: Path) ->
     small(tmp_path / "data")
     says = {"name": HOSTILE, "author": [HOSTILE], "citation": "```\n<script>\n```"}
     card = publish(tmp_path / "data", tmp_path / "card", form="npz", url="https://example.org/a", **says)
-    shown = page(card)
+    text = (card / "README.md").read_text().split("---\n", 2)[2]
+    shown = MarkdownIt("commonmark", {"html": True}).enable("table").render(text)
     assert "<script" not in shown
     assert shown.count("&lt;script&gt;") == 3
     # The names, whole, and the citation between its fences.

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from support.published import LAYOUTS, contents, publish, small
+from support.datasets import flip
+from support.published import contents, publish, small
 
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError
@@ -27,33 +28,22 @@ def test_the_same_command_gives_the_same_bytes(form: str, shards: Path, tmp_path
 
 
 def test_damage_is_found_before_anything_is_written(shards: Path, tmp_path: Path) -> None:
-    path = shards / "train-00001.npz"
-    content = bytearray(path.read_bytes())
-    content[-200] ^= 1
-    path.write_bytes(content)
+    flip(shards / "train-00001.npz", -200)
     with pytest.raises(InputError, match=r"train-00001\.npz: has changed since it was written"):
         publish(shards, tmp_path / "card", form="parquet")
     assert not (tmp_path / "card").exists()
 
 
-@pytest.fixture(scope="module")
-def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("formats")
-    for layout in LAYOUTS:
-        small(folder / layout, layout)
-    return folder
-
-
-def test_shards_are_published_as_they_are(work: Path, tmp_path: Path) -> None:
-    card = publish(work / "shuffled", tmp_path / "card", form="npz")
+def test_shards_are_published_as_they_are(shards: Path, tmp_path: Path) -> None:
+    card = publish(shards, tmp_path / "card", form="npz")
     assert verify(card / "data") == []
-    mine, theirs = contents(work / "shuffled"), contents(card / "data")
+    mine, theirs = contents(shards), contents(card / "data")
     assert set(mine) == set(theirs)
     changed = {name for name in mine if mine[name] != theirs[name]}
     assert changed == {"manifest.json", "config.yaml"}
     # Nobody learns where the author keeps the material.
     for content in contents(card).values():
-        assert str(work).encode() not in content
+        assert str(tmp_path).encode() not in content
 
 
 def test_links_do_not_change_with_the_data_set(tmp_path: Path) -> None:

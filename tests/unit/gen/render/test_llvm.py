@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -70,19 +67,14 @@ def test_an_installation_never_started_by_its_owner_works(run_python: RunPython,
     assert done.stdout == "llvm_ad_rgb\n"
 
 
-@pytest.fixture
-def library(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A library that the user chose, and an empty cache."""
-    path = tmp_path / "libLLVM.so.20.1"
-    path.write_bytes(b"x")
-    monkeypatch.setenv(engine.VARIABLE, str(path))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    return path
-
-
 def test_a_proof_is_cached_per_library_unless_it_fails(
-    library: Path, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    """Of a library that the user chose, with an empty cache."""
+    library = tmp_path / "libLLVM.so.20.1"
+    library.write_bytes(b"x")
+    monkeypatch.setenv(engine.VARIABLE, str(library))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     proofs, fault = [], "the process was ended by SIGABRT (LLVM ERROR: Cannot select)"
 
     def prove(variant: str) -> object:
@@ -110,9 +102,8 @@ print(drjit.thread_count())
 """
 
 
-def test_a_worker_renders_with_its_threads() -> None:
-    environment = {**os.environ, THREADS_VARIABLE: "3"}
-    shown = subprocess.run([sys.executable, "-c", SHOWN], env=environment, capture_output=True, text=True)
+def test_a_worker_renders_with_its_threads(run_python: RunPython) -> None:
+    shown = run_python("-c", SHOWN, **{THREADS_VARIABLE: "3"})
     assert shown.stdout.split() == ["3"], shown.stderr
 
 

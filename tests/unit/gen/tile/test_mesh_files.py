@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.fuzzing import damaged, examples, loads_or_refuses
+from support.fuzzing import damaged, loads_or_refuses
 from support.gltf_files import TWO_TRIANGLES, GltfBuilder
 from support.jobs import job_of
 
@@ -111,7 +111,7 @@ SAMPLES = {".ply": PLY.encode(), ".obj": OBJ.encode(), ".glb": bumps().export(fi
 
 
 @given(data=st.data())
-@examples(60)
+@settings(max_examples=60)
 def test_damaged_files(data: st.DataObject, tmp_path_factory: pytest.TempPathFactory) -> None:
     kind, content = data.draw(damaged(SAMPLES))
     path = tmp_path_factory.mktemp("fuzz") / f"a{kind}"

@@ -25,16 +25,11 @@ from mbtf_pipeline.compare.timing import LIGHTS, measure_timing
 from mbtf_pipeline.recipe import SceneView
 
 
-def noisy(truth: np.ndarray, noise: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    random = np.random.default_rng(seed)
-    a, b = (truth + noise * random.standard_normal(truth.shape) for _ in range(2))
-    return a, b
-
-
 def test_noise_of_the_reference_hardly_biases_the_relative_error() -> None:
     """Only the denominator includes it; the square of one half's difference would be twice as large."""
-    truth = np.ones((96, 96, 3))
-    found = image_errors(truth + 0.03, *noisy(truth, 0.03, 7), 1.0)["relative_mse"]
+    truth, random = np.ones((96, 96, 3)), np.random.default_rng(7)
+    a, b = (truth + 0.03 * random.standard_normal(truth.shape) for _ in range(2))
+    found = image_errors(truth + 0.03, a, b, 1.0)["relative_mse"]
     assert found.value == pytest.approx(0.03**2 / 1.01, rel=0.15)
     assert found.error < 0.03 * found.value
 

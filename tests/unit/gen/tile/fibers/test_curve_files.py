@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.fuzzing import damaged, examples, loads_or_refuses
+from support.fuzzing import damaged, loads_or_refuses
 
 from mbtf_core.errors import InputError
 from mbtf_gen.tile.fibers import curve_file, weave
@@ -139,7 +139,7 @@ SAMPLES = {
 
 
 @given(data=st.data())
-@examples(150)
+@settings(max_examples=150)
 def test_damaged_files(data: st.DataObject, tmp_path_factory: pytest.TempPathFactory) -> None:
     kind, content = data.draw(damaged(SAMPLES))
     folder = tmp_path_factory.mktemp("fuzz")

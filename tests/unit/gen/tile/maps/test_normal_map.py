@@ -18,16 +18,10 @@ from mbtf_gen.tile.maps.normal_map import fit_normals
 ASSET = ROOT / "assets/turtle_shell/height.exr"
 
 
-def height_map(kind: str) -> Floats:
-    if kind == "fractal":
-        return fractal(96, 96)
-    return np.asarray(gray(read_image(ASSET))[0], np.float64)
-
-
 @pytest.mark.parametrize("kind", ["fractal", "asset"])
 @pytest.mark.parametrize("green", [1, -1])
 def test_convention_and_scale(kind: str, green: int) -> None:
-    height = height_map(kind)
+    height = fractal(96, 96) if kind == "fractal" else np.asarray(gray(read_image(ASSET))[0], np.float64)
     found = fit_normals(height, normals_of(height, 0.07) * [1, green, 1])
     assert found.fits
     assert not found.inverted
