@@ -198,8 +198,10 @@ class ReferenceImage:
         """Write ``path`` + ``.exr`` with all channels, atomically, and return its path."""
         spp = np.full(self.value_a.shape[:2], self.spp, np.float32)
         arrays = {"value_a": self.value_a, "value_b": self.value_b, "spp": spp}
-        arrays |= {} if self.queries is None else vars(self.queries)
-        arrays |= {} if self.transmittance is None else {"transmittance": self.transmittance}
+        if self.queries is not None:
+            arrays |= vars(self.queries)
+        if self.transmittance is not None:
+            arrays["transmittance"] = self.transmittance
         exr = path.with_name(f"{path.name}.exr")
         found = {name: array[None] for name, array in arrays.items()}
         write_exr(exr, found, complete=self.queries is not None)
