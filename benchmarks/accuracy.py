@@ -43,8 +43,8 @@ from numpy.typing import NDArray
 from mbtf_core.stats.estimate import level_groups
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.engine.runtime import load_mitsuba
-from mbtf_gen.job import Job
 from mbtf_gen.planning.adaptive import estimate_shard, round_up
+from mbtf_gen.planning.job import Job
 from mbtf_gen.planning.run_plan import plan_run, reference_plan
 from mbtf_gen.planning.sample_allocation import measure_allocation
 from mbtf_gen.planning.simulation import build_estimator

@@ -28,9 +28,9 @@ import numpy as np
 from common import ASSETS, finish, parser_of, start
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job
 from mbtf_gen.planning.bounds import Change
 from mbtf_gen.planning.effects_plan import EffectsPlan, without
+from mbtf_gen.planning.job import Job
 from mbtf_gen.planning.run_plan import PILOT_ROULETTE, SMALL_RUN, measured, plan_effects
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream

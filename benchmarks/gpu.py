@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from mbtf_core.run.processes import ChildResult, run_child
 from mbtf_core.stats import Estimate, level_groups, mean_estimate, mse_difference, noise_free_mse
-from mbtf_gen.selftest import STANDARD_ERRORS
+from mbtf_gen.diagnostics.selftest import STANDARD_ERRORS
 
 ASSET = ASSETS / "cliff_rock"
 # Relative differences that are accepted beside the statistical error: of the mean value; of the values of a

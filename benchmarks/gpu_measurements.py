@@ -95,9 +95,9 @@ def save_finite(path: str | Path, **arrays: Any) -> None:
 
 def selftest() -> Answers:
     """State of every check of ``mbtf-gen selftest``, or why it could not run."""
-    from mbtf_gen.checks import run_check
+    from mbtf_gen.diagnostics.checks import run_check
+    from mbtf_gen.diagnostics.selftest import all_checks
     from mbtf_gen.engine.runtime import load_mitsuba
-    from mbtf_gen.selftest import all_checks
 
     load_mitsuba()
     for found in map(run_check, all_checks()):
@@ -119,7 +119,7 @@ def estimate(device: str, sizes: str, shards: str, out: str) -> Answers:
     from mbtf_core.data.schema import Queries
     from mbtf_fit.data.loader import load_split
     from mbtf_gen.generation.folder import read_run_plan
-    from mbtf_gen.job import Job
+    from mbtf_gen.planning.job import Job
     from mbtf_gen.planning.simulation import build_estimator
     from mbtf_gen.render.estimates import Stream
 

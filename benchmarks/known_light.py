@@ -25,7 +25,7 @@ from mbtf_fit import FitConfig, fit
 from mbtf_fit.pytorch import material
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation.run import generate
-from mbtf_gen.job import Job
+from mbtf_gen.planning.job import Job
 
 KNOWN = ("nothing", "visibility", "reflection", "direct")
 QUERIES = {"train": "200/texel", "test": "32768", "spp": 4, "test_spp": 32, "test_highlights": 0.75}

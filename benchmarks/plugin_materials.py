@@ -140,7 +140,7 @@ def energies(material: Path, shards: Path, evaluator: Any) -> list[dict[str, flo
     from mbtf_core.data.dataset import Dataset
     from mbtf_core.data.schema import Queries
     from mbtf_gen.config.generator import GeneratorConfig
-    from mbtf_gen.job import Job
+    from mbtf_gen.planning.job import Job
     from mbtf_gen.planning.run_plan import reference_plan
     from mbtf_gen.planning.simulation import build_estimator
     from mbtf_gen.render.estimates import Stream

@@ -271,7 +271,7 @@ def preset_recipe(path: Path, quality: Quality | None, assignments: Sequence[str
     recipe = load_recipe(path, assignments, presets=preset)
     if f"generate.{RESOLUTION}" not in preset:
         return recipe
-    from mbtf_gen.job import Job, limit_resolution
+    from mbtf_gen.planning.job import Job, limit_resolution
 
     return recipe.model_copy(update={"generate": limit_resolution(Job.load(recipe.generate)).config})
 

@@ -154,7 +154,7 @@ class _RecipeRun:
         from mbtf_core.data.folder import sidecar_name
         from mbtf_core.data.schema import MANIFEST_NAME
         from mbtf_gen.generation.run import generate, unfinished
-        from mbtf_gen.job import Job, data_bytes
+        from mbtf_gen.planning.job import Job, data_bytes
 
         job = Job.load(data.config)
         if data.stage == GENERATE_STAGE:  # that of another layout is of the same material

@@ -136,7 +136,7 @@ def main() -> None:
     materials = {name: fitted(name) for name in (MATERIALS if table else MATERIALS[:1])}
     load_mitsuba()
     import mbtf_fit.backends.mitsuba
-    from mbtf_gen.job import Job
+    from mbtf_gen.planning.job import Job
 
     mbtf_fit.backends.mitsuba.register()
     views = {name: seen(name, tiles) for name, tiles in (MEASURED if table else TILES).items()}

@@ -35,7 +35,7 @@ from mbtf_core.files.atomic import (
     write_checksummed,
 )
 from mbtf_core.files.folders import cache_folder, make_folder, remove_unfinished
-from mbtf_core.locks import lock_owner, shard_lock, take_lock
+from mbtf_core.files.locks import lock_owner, shard_lock, take_lock
 
 # Files that a run writes, unfinished files that a killed run leaves, and locks.
 _SHARD = rf"(?:{'|'.join(SPLITS)})-\d+"

@@ -21,7 +21,7 @@ from mbtf_core.errors import EngineError, InputError, PartialError, UsageError, 
 from mbtf_core.extras import extra_error, import_extra
 from mbtf_core.files.atomic import create_file, remove_file, write_chunks
 from mbtf_core.paths import refuse_special, split_url
-from mbtf_core.timeouts import NoAnswer, call_within
+from mbtf_core.run.timeouts import NoAnswer, call_within
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")

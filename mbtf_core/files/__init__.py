@@ -1,1 +1,1 @@
-"""Files and folders: written safely, digested, owned."""
+"""Files and folders: written safely, digested, owned, locked."""

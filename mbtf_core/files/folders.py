@@ -32,7 +32,7 @@ from mbtf_core.files.atomic import (
     write_json,
 )
 from mbtf_core.files.editable import changed, write_document
-from mbtf_core.locks import lock_owner, take_lock
+from mbtf_core.files.locks import lock_owner, take_lock
 from mbtf_core.units import size_text
 
 # Names of temporary files and locks, such as a killed process leaves.

@@ -16,8 +16,8 @@ from typing import Any
 
 from mbtf_core.errors import reason
 from mbtf_core.extras import import_extra
+from mbtf_core.run.timeouts import call_within
 from mbtf_core.run.workers import MEMORY, PRELOAD, ClusterConfig
-from mbtf_core.timeouts import call_within
 
 # Class of dask-jobqueue, and the command that submits a job.
 _SYSTEMS = {

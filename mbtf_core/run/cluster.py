@@ -22,8 +22,8 @@ from mbtf_core.extras import extra_error, has_extra, import_extra
 from mbtf_core.run.batch import site_preload, submitted_jobs
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import GPUS_VARIABLE, THREADS_VARIABLE, Item, Result, TaskFunction, packed, run_task
+from mbtf_core.run.timeouts import NoAnswer, call_within
 from mbtf_core.run.workers import MEMORY, ClusterConfig, read_cluster
-from mbtf_core.timeouts import NoAnswer, call_within
 from mbtf_core.units import format_duration
 
 # Seconds in which a client of a silent scheduler closes.

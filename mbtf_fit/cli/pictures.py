@@ -7,7 +7,7 @@ from pathlib import Path
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Options, Output, Overwrite, PathText, options_from
 from mbtf_core.errors import UsageError
-from mbtf_fit.preview.config import ComparisonConfig, MaterialPreviewConfig
+from mbtf_fit.pictures.config import ComparisonConfig, MaterialPreviewConfig
 
 
 @options_from(MaterialPreviewConfig)
@@ -35,7 +35,7 @@ def preview(
         Folder made by mbtf-fit.
     """
     from mbtf_core.files.folders import owned
-    from mbtf_fit.preview.sheet import draw
+    from mbtf_fit.pictures.sheet import draw
 
     if material is None and options.config is None:
         raise UsageError("no material given", hint="mbtf-fit preview material/ -o preview/")
@@ -76,6 +76,6 @@ def compare(
     if options.config is None and (material is None or shards is None):
         raise UsageError("name a material and its data set", hint="mbtf-fit compare material/ shards/")
     config = options.resolve(material=material, shards=shards)
-    from mbtf_fit.comparison import compare
+    from mbtf_fit.pictures.comparison import compare
 
     compare(config, output, console, overwrite=overwrite)

@@ -12,8 +12,8 @@ from mbtf_gen.cli.pictures import preview, reference
 
 def doctor(*, console: Console = CONSOLE) -> int:
     """Test the installation, and suggest a fix for each failure."""
-    from mbtf_gen.checks import report_checks
-    from mbtf_gen.doctor import all_checks
+    from mbtf_gen.diagnostics.checks import report_checks
+    from mbtf_gen.diagnostics.doctor import all_checks
     from mbtf_gen.engine.runtime import use_shipped_llvm
 
     use_shipped_llvm()
@@ -25,9 +25,9 @@ def selftest(*, console: Console = CONSOLE) -> int:
 
     It reports the largest deviations. Exit code 0 when every check passed, 3 otherwise.
     """
-    from mbtf_gen.checks import report_checks
+    from mbtf_gen.diagnostics.checks import report_checks
+    from mbtf_gen.diagnostics.selftest import all_checks
     from mbtf_gen.engine.runtime import load_mitsuba
-    from mbtf_gen.selftest import all_checks
 
     load_mitsuba()
     return report_checks(all_checks(), console)

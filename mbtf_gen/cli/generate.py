@@ -29,7 +29,7 @@ from mbtf_gen.config.generator import RESOLUTION, GeneratorConfig, generator_opt
 
 if TYPE_CHECKING:
     from mbtf_gen.generation.manifest import Summary
-    from mbtf_gen.job import Job
+    from mbtf_gen.planning.job import Job
 
 G = TypeVar("G", bound=GeneratorConfig)
 
@@ -55,7 +55,7 @@ def prepare_job(
 ) -> Job:
     """The data set that a command line asks for, with its material loaded; errors as :func:`resolve_config`
     and of the material."""
-    from mbtf_gen.job import Job, limit_resolution
+    from mbtf_gen.planning.job import Job, limit_resolution
 
     preset = generator_options(quality, options.explicit())
     job = Job.load(resolve_config(options, material, preset))
@@ -103,7 +103,7 @@ def generate(
     from mbtf_core.files.folders import check_space
     from mbtf_core.run.cluster import open_runner
     from mbtf_gen.generation.run import generate, unfinished
-    from mbtf_gen.job import data_bytes, split_queries
+    from mbtf_gen.planning.job import data_bytes, split_queries
 
     folder = DataFolder.open(output)
     left = unfinished(job, folder, index, count, overwrite)

@@ -73,8 +73,8 @@ def plan(
     material
         Height map, folder of maps, material.yaml, mesh, yarns or fibers.
     """
-    from mbtf_gen.forecast import forecast
-    from mbtf_gen.job import split_target
+    from mbtf_gen.planning.forecast import forecast
+    from mbtf_gen.planning.job import split_target
     from mbtf_gen.planning.run_plan import allocate, measured, plan_effects, skips_pilots
 
     job = prepare_job(options, material, quality)

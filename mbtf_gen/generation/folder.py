@@ -22,9 +22,9 @@ from mbtf_core.files.folders import (
     other_configuration,
     remove_unfinished,
 )
-from mbtf_core.locks import brief_lock
+from mbtf_core.files.locks import brief_lock
 from mbtf_gen.generation.manifest import DataSource, build_manifest, stored_plan
-from mbtf_gen.job import Job
+from mbtf_gen.planning.job import Job
 from mbtf_gen.planning.run_plan import RunPlan
 from mbtf_gen.planning.simulation import geometry_of
 

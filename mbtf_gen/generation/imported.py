@@ -26,11 +26,11 @@ from mbtf_gen.config.generator import count_queries
 from mbtf_gen.generation.folder import claim_folder
 from mbtf_gen.generation.manifest import Summary, finish, new_manifest
 from mbtf_gen.generation.shard_record import store_shard
-from mbtf_gen.job import shard_entries
 from mbtf_gen.measured.hdf5 import NeumipQueries
 from mbtf_gen.measured.interface import MeasuredBtf
 from mbtf_gen.measured.kinds import open_measured
 from mbtf_gen.measured.ubo2003 import SUFFIXES
+from mbtf_gen.planning.job import shard_entries
 from mbtf_gen.sampling.rng import Purpose, numpy_generator
 
 I64 = NDArray[np.int64]

@@ -21,11 +21,11 @@ from mbtf_core.data.schema import CONFIG_NAME, MANIFEST_NAME
 from mbtf_core.data.verify import INCOMPLETE, Fault, verify
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import checksummed
-from mbtf_core.locks import brief_lock
+from mbtf_core.files.locks import brief_lock
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.manifest import build_manifest
 from mbtf_gen.generation.run import ProgressCallback, generate
-from mbtf_gen.job import Job
+from mbtf_gen.planning.job import Job
 from mbtf_gen.planning.run_plan import plan_run
 from mbtf_gen.planning.simulation import geometry_of
 

@@ -21,7 +21,7 @@ from mbtf_core.data.documents import finished_record, plan_digest, upload_waitin
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.data.schema import MANIFEST_NAME, Queries, ShardEntry
 from mbtf_core.errors import InputError, LockedError, PartialError, UsageError, check_type
-from mbtf_core.locks import lock_owner, take_lock
+from mbtf_core.files.locks import lock_owner, take_lock
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Item, Result
 from mbtf_core.units import rate_text
@@ -29,8 +29,16 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.folder import has_dataset, open_folder, read_run_plan
 from mbtf_gen.generation.manifest import Summary, finish
 from mbtf_gen.generation.shard_record import ShardStatistics, store_shard
-from mbtf_gen.job import Job, most_paths, planned_paths, received_job, split_lights, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
+from mbtf_gen.planning.job import (
+    Job,
+    most_paths,
+    planned_paths,
+    received_job,
+    split_lights,
+    split_spp,
+    split_target,
+)
 from mbtf_gen.planning.run_plan import RunPlan, plan_run
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Estimates, Stream

@@ -11,12 +11,12 @@ from mbtf_core.files.folders import check_space, owned
 from mbtf_core.pictures import PNG_BYTES, claim_pictures, tiles_camera, write_display
 from mbtf_core.stats import pooled_relative_error
 from mbtf_gen.config.pictures import PreviewConfig
-from mbtf_gen.job import Job
 from mbtf_gen.pictures.reference import (
     note_fine_pixels,
     picture_estimator,
     render_reference,
 )
+from mbtf_gen.planning.job import Job
 
 # Noise relative to the mean value from which more paths are recommended.
 _NOISY = 0.2

@@ -40,9 +40,9 @@ from mbtf_core.run.task import Item
 from mbtf_core.stats import pooled_relative_error
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.pictures import ReferenceConfig, ReferenceSection, Shape, ViewSection
-from mbtf_gen.job import Job
 from mbtf_gen.pictures.displaced_mesh import DisplacedMesh
 from mbtf_gen.pictures.shapes import Chart, render_shape
+from mbtf_gen.planning.job import Job
 from mbtf_gen.planning.run_plan import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from mbtf_core.errors import InputError, UsageError
 from mbtf_core.pictures import PIXEL_SIGMA, Camera, ReferenceImage
 from mbtf_gen.config.pictures import Shape
-from mbtf_gen.job import Job
+from mbtf_gen.planning.job import Job
 from mbtf_gen.sampling.light_kernel import LightKernel
 from mbtf_gen.tile.heights import MOST_CELLS, HeightGrid, grid_faces
 

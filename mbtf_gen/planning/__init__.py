@@ -1,1 +1,1 @@
-"""What a run simulates and how many paths each query gets."""
+"""What a run computes: its job (configuration, material, queries), effects, paths per query, and forecast."""

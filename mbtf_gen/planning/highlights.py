@@ -32,8 +32,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.data.schema import Queries
-from mbtf_gen.job import Job, split_queries
 from mbtf_gen.planning.effects_plan import EffectsPlan
+from mbtf_gen.planning.job import Job, split_queries
 from mbtf_gen.planning.sample_allocation import direction_terms, evaluate_terms, fit_log_linear, mean_values
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Stream

@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from mbtf_gen.job import Job, planned_paths
 from mbtf_gen.planning.bounds import CAUTION, FEW, POINTS, Change, DisplacementBounds, displacement_bounds
 from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.effects_plan import EffectsPlan, consistent, without
 from mbtf_gen.planning.highlights import Highlights, measure_highlights
+from mbtf_gen.planning.job import Job, planned_paths
 from mbtf_gen.planning.sample_allocation import PILOT_QUERIES as ALLOCATION_QUERIES
 from mbtf_gen.planning.sample_allocation import PILOT_SPP as ALLOCATION_SPP
 from mbtf_gen.planning.sample_allocation import Allocation, measure_allocation

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.data.schema import Queries
-from mbtf_gen.job import Job, split_lights
 from mbtf_gen.planning.effects_plan import EffectsPlan
+from mbtf_gen.planning.job import Job, split_lights
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.sampling import exact_math as exact

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.errors import UsageError
-from mbtf_gen.job import Job
 from mbtf_gen.planning.bounds import Change, DisplacementBounds
+from mbtf_gen.planning.job import Job
 from mbtf_gen.tile.heights import triangle_slopes
 from mbtf_gen.tile.maps.material_file import REFLECTING
 from mbtf_gen.tile.protocol import Tile

@@ -13,9 +13,9 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.schema import Queries
 from mbtf_core.images.resample import resample
 from mbtf_gen.engine.runtime import CPU_VARIANT, load_mitsuba
-from mbtf_gen.job import Job
 from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.effects_plan import EffectsPlan
+from mbtf_gen.planning.job import Job
 from mbtf_gen.render.estimates import Estimates, Stream
 from mbtf_gen.tile.heights import height_slopes
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from mbtf_core.pictures import PixelKind, ReferenceImage
     from mbtf_core.run.runner import Runner
     from mbtf_fit import Material
-    from mbtf_gen.job import Job
+    from mbtf_gen.planning.job import Job
 
 COMPARISON_NAME = "comparison.json"
 COMPARISON_FORMAT = "mbtf-comparison"
@@ -64,8 +64,8 @@ def compare(
     """
     from mbtf_core.data.dataset import Dataset
     from mbtf_fit import Material
-    from mbtf_gen.job import Job
     from mbtf_gen.pictures.reference import picture_estimator
+    from mbtf_gen.planning.job import Job
 
     if section.st_lpips:
         require()

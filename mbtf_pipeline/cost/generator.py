@@ -24,9 +24,9 @@ from mbtf_core.data.schema import Queries
 from mbtf_core.errors import InputError
 from mbtf_core.stats import Estimate, mean_estimate, signal_variance
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.forecast import median_estimate
-from mbtf_gen.job import Job, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
+from mbtf_gen.planning.forecast import median_estimate
+from mbtf_gen.planning.job import Job, split_spp, split_target
 from mbtf_gen.planning.run_plan import allocate, plan_effects
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.estimates import Stream

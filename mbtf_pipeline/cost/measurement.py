@@ -16,7 +16,7 @@ from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import data_sha256, read_json, write_json
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job
+from mbtf_gen.planning.job import Job
 from mbtf_pipeline.tables import estimate
 
 # Raised when the method of measuring changes: older measurements are then repeated.

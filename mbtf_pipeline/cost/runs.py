@@ -28,7 +28,7 @@ from mbtf_fit.config import DEFAULT_MODEL, best_options
 from mbtf_fit.sections import TimeBudget
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import generate
-from mbtf_gen.job import Job
+from mbtf_gen.planning.job import Job
 from mbtf_pipeline.cost.measurement import Conditions, Configuration, Measurement
 
 if TYPE_CHECKING:

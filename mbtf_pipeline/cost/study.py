@@ -20,7 +20,7 @@ from mbtf_core.run.task import failure
 from mbtf_core.stats import Estimate
 from mbtf_core.units import clock, format_duration, size_text
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job
+from mbtf_gen.planning.job import Job
 from mbtf_pipeline.cost.generator import benchmark_of, generator_configurations, path_seconds
 from mbtf_pipeline.cost.measurement import (
     CONFIG_NAME,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mbtf_gen import selftest
+from mbtf_gen.diagnostics import selftest
 from mbtf_gen.tile.heights import HeightGrid
 
 F64 = NDArray[np.float64]

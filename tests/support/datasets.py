@@ -22,8 +22,8 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.folder import open_folder
 from mbtf_gen.generation.manifest import finish
 from mbtf_gen.generation.run import ShardRun
-from mbtf_gen.job import Job, split_spp
 from mbtf_gen.planning.highlights import Highlights
+from mbtf_gen.planning.job import Job, split_spp
 from mbtf_gen.planning.run_plan import RunPlan, reference_plan
 from mbtf_gen.render.estimates import Estimates
 

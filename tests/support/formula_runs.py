@@ -10,7 +10,7 @@ import numpy as np
 
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.engine.runtime import load_mitsuba
-from mbtf_gen.job import Job
+from mbtf_gen.planning.job import Job
 from mbtf_gen.planning.run_plan import RunPlan, reference_plan
 from support.datasets import formula
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job
+from mbtf_gen.planning.job import Job
 from mbtf_gen.tile.heightfield_tile import HeightFieldTile
 from mbtf_gen.tile.protocol import Tile
 

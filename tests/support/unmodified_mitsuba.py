@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from mbtf_core.pictures import PIXEL_SIGMA, Camera
 from mbtf_core.stats import Estimate, mean_estimate
 from mbtf_gen.config.generator import GeneratorConfig, LightSection
-from mbtf_gen.job import Job
+from mbtf_gen.planning.job import Job
 from mbtf_gen.tile.maps.material_file import ROLES
 from mbtf_gen.tile.protocol import Tile
 from support.mitsuba_blocks import instances

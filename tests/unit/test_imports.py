@@ -22,9 +22,9 @@ PACKAGES = ("mbtf_core", "mbtf_gen", "mbtf_fit", "mbtf_pipeline")
 ROOMS = {
     "mbtf_core": ". config files run app images meshes data stats pictures",
     "mbtf_gen": "sampling measured engine config tile.tracers tile.heights tile.fibers tile.maps tile render"
-    " checks doctor,selftest job planning forecast generation pictures publishing cli .",
+    " diagnostics planning generation pictures publishing cli .",
     "mbtf_fit": "sections formatting threads ops data native surface pytorch objective backends.cpu models"
-    " config material maps evaluation training backends.mitsuba backends.shader preview comparison"
+    " config material maps evaluation training backends.mitsuba backends.shader pictures"
     " viewer export cli .",
     "mbtf_pipeline": "recipe compare stages tables report run collection cost cli .",
 }
@@ -39,8 +39,8 @@ FORBIDDEN = {
     "mbtf_gen": {"torch"},
     "mbtf_fit": {"mitsuba", "drjit", "mbtf_gen"},
     "mbtf_fit.backends.mitsuba": {"torch", "trimesh"},
-    "mbtf_fit.preview": {"torch", "trimesh"},
-    "mbtf_fit.comparison": {"mitsuba", "drjit"},
+    "mbtf_fit.pictures": {"torch", "trimesh"},
+    "mbtf_fit.pictures.comparison": {"mitsuba", "drjit"},
     "mbtf_pipeline": set(),
 }
 
@@ -150,7 +150,12 @@ def test_no_two_public_classes_share_a_name() -> None:
 
 def test_commands_set_llvm_before_dr_jit_is_imported(run_python: RunPython) -> None:
     """Dr.Jit takes the system's LLVM, however old, if it is imported first."""
-    names = "mbtf_fit.preview.sheet", "mbtf_fit.comparison", "mbtf_fit.training.fit", "mbtf_pipeline.run"
+    names = (
+        "mbtf_fit.pictures.sheet",
+        "mbtf_fit.pictures.comparison",
+        "mbtf_fit.training.fit",
+        "mbtf_pipeline.run",
+    )
     imports = "; ".join(f"import {name}" for name in (*names, "sys"))
     done = run_python("-c", f"{imports}; print('drjit' in sys.modules)")
     assert done.stdout.strip() == "False", done.stderr

@@ -19,7 +19,7 @@ from support.scenes import queries
 from support.surfaces import point, vectors
 
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job
+from mbtf_gen.planning.job import Job
 from mbtf_gen.planning.run_plan import reference_plan
 from mbtf_gen.planning.simulation import build_estimator
 from mbtf_gen.render.bsdf.surface import SurfaceParts

@@ -18,8 +18,8 @@ from mbtf_core.pictures import Camera, ReferenceImage
 from mbtf_fit.backends.mitsuba import register
 from mbtf_fit.surface.known import KnownSurface
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job
 from mbtf_gen.pictures.shapes import Chart, render_scene, render_shape, shape_scene
+from mbtf_gen.planning.job import Job
 
 register("llvm_ad_rgb")
 

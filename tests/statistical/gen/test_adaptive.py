@@ -20,8 +20,8 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation.manifest import finish
 from mbtf_gen.generation.run import generate
-from mbtf_gen.job import Job, split_spp, split_target
 from mbtf_gen.planning.adaptive import estimate_shard
+from mbtf_gen.planning.job import Job, split_spp, split_target
 from mbtf_gen.planning.run_plan import plan_effects, plan_run
 from mbtf_gen.planning.sample_allocation import Allocation, fit_allocation
 from mbtf_gen.planning.simulation import build_estimator

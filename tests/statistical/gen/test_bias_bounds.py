@@ -13,11 +13,11 @@ from support import jobs
 from support.height_maps import slope_normals
 from support.jobs import height_field
 
-from mbtf_gen.job import Job
 from mbtf_gen.planning import run_plan
 from mbtf_gen.planning.bounds import Change, displacement_bounds
 from mbtf_gen.planning.effects import bounce_bound
 from mbtf_gen.planning.effects_plan import EffectsPlan, without
+from mbtf_gen.planning.job import Job
 from mbtf_gen.planning.run_plan import plan_effects
 from mbtf_gen.planning.scene import EffectsRequest, PlanScene
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries

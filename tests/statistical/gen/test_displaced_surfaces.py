@@ -14,9 +14,9 @@ from mbtf_core.directions import from_angles
 from mbtf_core.pictures import Camera, ReferenceImage
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.config.pictures import Shape
-from mbtf_gen.job import Job
 from mbtf_gen.pictures.displaced_mesh import DisplacedMesh
 from mbtf_gen.pictures.shapes import Chart, render_shape
+from mbtf_gen.planning.job import Job
 
 SIZE, SPP = 72, 32
 F64 = NDArray[np.float64]

@@ -15,9 +15,9 @@ from support.jobs import height_field
 from support.scenes import rocks
 
 from mbtf_core.stats import Estimate, mean_of_halves
-from mbtf_gen.job import Job
 from mbtf_gen.planning.bounds import Change
 from mbtf_gen.planning.effects_plan import EffectsPlan, without
+from mbtf_gen.planning.job import Job
 from mbtf_gen.planning.run_plan import plan_effects
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream

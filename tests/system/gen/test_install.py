@@ -9,7 +9,7 @@ import pytest
 from conftest import RunPython
 from support.paths import ASSETS
 
-from mbtf_gen import doctor
+from mbtf_gen.diagnostics import doctor
 
 
 def test_a_healthy_installation_passes_its_checks(run_python: RunPython) -> None:

@@ -11,9 +11,9 @@ import pytest
 
 from mbtf_core.app.console import Console
 from mbtf_core.errors import EngineError
-from mbtf_gen import selftest
-from mbtf_gen.checks import Absent, Check, report_checks, run_check
-from mbtf_gen.selftest import Case, verdict
+from mbtf_gen.diagnostics import selftest
+from mbtf_gen.diagnostics.checks import Absent, Check, report_checks, run_check
+from mbtf_gen.diagnostics.selftest import Case, verdict
 
 
 @pytest.mark.parametrize(

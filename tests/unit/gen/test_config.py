@@ -12,7 +12,7 @@ from mbtf_core.config.settings import resolve
 from mbtf_core.errors import InputError, UsageError
 from mbtf_gen.config.exchange import PublishConfig
 from mbtf_gen.config.generator import GeneratorConfig, count_queries
-from mbtf_gen.job import Job, most_paths, planned_paths, split_queries
+from mbtf_gen.planning.job import Job, most_paths, planned_paths, split_queries
 from mbtf_gen.tile.loading import load_material
 
 

@@ -25,7 +25,7 @@ from mbtf_core.data.geometry import (
 from mbtf_core.errors import InputError
 from mbtf_core.images.exr import encode_parts
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job
+from mbtf_gen.planning.job import Job
 from mbtf_gen.planning.run_plan import reference_plan
 from mbtf_gen.planning.simulation import geometry_of
 from mbtf_gen.tile.loading import load_material

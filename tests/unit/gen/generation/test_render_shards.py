@@ -13,13 +13,13 @@ import pytest
 
 from mbtf_core.data.folder import DataFolder
 from mbtf_core.errors import InputError, PartialError
-from mbtf_core.locks import lock_file_of
+from mbtf_core.files.locks import lock_file_of
 from mbtf_core.run.runner import Runner
 from mbtf_core.run.task import Result, exhausted
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.folder import open_folder
 from mbtf_gen.generation.run import ShardRun, render_shard, render_shards
-from mbtf_gen.job import Job, received_job
+from mbtf_gen.planning.job import Job, received_job
 from mbtf_gen.planning.run_plan import plan_run
 
 SHARD = "train-00001.npz"

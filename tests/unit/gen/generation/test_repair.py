@@ -19,7 +19,7 @@ from mbtf_fit.cli.app import app as fit_app
 from mbtf_gen.cli.app import app
 from mbtf_gen.generation import repair as repairs
 from mbtf_gen.generation.repair import repair
-from mbtf_gen.job import Job
+from mbtf_gen.planning.job import Job
 from mbtf_gen.planning.run_plan import RunPlan, reference_plan
 from mbtf_gen.planning.simulation import ClosedForm
 

@@ -25,8 +25,8 @@ from mbtf_gen.generation import repair as repairs
 from mbtf_gen.generation import run as generation
 from mbtf_gen.generation.run import generate
 from mbtf_gen.generation.shard_record import ShardStatistics
-from mbtf_gen.job import Job
 from mbtf_gen.planning.effects_plan import EffectsPlan
+from mbtf_gen.planning.job import Job
 from mbtf_gen.planning.simulation import geometry_of
 
 load_mitsuba()

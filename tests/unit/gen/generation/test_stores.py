@@ -28,7 +28,7 @@ from mbtf_gen.cli.app import app
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.folder import read_run_plan
 from mbtf_gen.generation.run import ShardRun, render_shard
-from mbtf_gen.job import Job
+from mbtf_gen.planning.job import Job
 from mbtf_gen.planning.simulation import ClosedForm
 
 

@@ -17,13 +17,13 @@ from mbtf_core.data.geometry import geometry_record
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError, PartialError
 from mbtf_core.files.atomic import checksummed, create_file
-from mbtf_core.locks import shard_lock, take_lock
+from mbtf_core.files.locks import shard_lock, take_lock
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.generation import run as generation
 from mbtf_gen.generation.manifest import build_manifest, finish
 from mbtf_gen.generation.run import generate
-from mbtf_gen.job import Job
+from mbtf_gen.planning.job import Job
 from mbtf_gen.planning.run_plan import RunPlan, reference_plan
 from mbtf_gen.planning.simulation import geometry_of
 

@@ -13,9 +13,9 @@ from support.jobs import height_field, job_of
 
 from mbtf_core.errors import UsageError
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job
 from mbtf_gen.planning.effects import EFFECTS
 from mbtf_gen.planning.effects_plan import EffectsPlan
+from mbtf_gen.planning.job import Job
 from mbtf_gen.planning.run_plan import measured, plan_effects, plan_run, reference_plan
 
 HEIGHTS = np.array([[0.0, 0.1], [0.05, 0.02]])

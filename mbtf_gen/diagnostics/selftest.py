@@ -20,7 +20,7 @@ from mbtf_core.data.schema import Queries
 from mbtf_core.directions import from_angles
 from mbtf_core.errors import EngineError
 from mbtf_core.stats import mean_estimate
-from mbtf_gen.checks import Check
+from mbtf_gen.diagnostics.checks import Check
 from mbtf_gen.engine.runtime import load_mitsuba
 from mbtf_gen.sampling.light_kernel import LightKernel
 from mbtf_gen.tile.heights import HeightGrid

@@ -14,7 +14,8 @@ import numpy as np
 from mbtf_core.data.shard_files import write_shard
 from mbtf_core.stats import Estimate, pooled_error
 from mbtf_core.units import clock, rate_text, size_text
-from mbtf_gen.job import (
+from mbtf_gen.planning.adaptive import estimate_shard
+from mbtf_gen.planning.job import (
     Job,
     data_bytes,
     path_work,
@@ -23,7 +24,6 @@ from mbtf_gen.job import (
     split_spp,
     split_target,
 )
-from mbtf_gen.planning.adaptive import estimate_shard
 from mbtf_gen.planning.run_plan import RunPlan, allocate, plan_effects
 from mbtf_gen.planning.simulation import build_estimator, pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream, Target

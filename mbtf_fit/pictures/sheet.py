@@ -21,8 +21,8 @@ from mbtf_core.files.folders import check_space
 from mbtf_core.pictures import PNG_BYTES, Camera, claim_pictures, write_png
 from mbtf_core.units import tiles_text
 from mbtf_fit.material.format import read_description
-from mbtf_fit.preview.config import MaterialPreviewConfig, SheetSection
-from mbtf_fit.preview.grid import grid
+from mbtf_fit.pictures.config import MaterialPreviewConfig, SheetSection
+from mbtf_fit.pictures.grid import grid
 from mbtf_gen.config.pictures import Direction
 from mbtf_gen.engine.runtime import load_mitsuba
 

@@ -14,8 +14,8 @@ from mbtf_core.directions import from_angles
 from mbtf_core.pictures import Camera
 from mbtf_fit.backends.mitsuba.evaluator import Evaluator
 from mbtf_fit.backends.mitsuba.stored_material import read_material
-from mbtf_fit.preview import grid, sheet
-from mbtf_fit.preview.config import SheetSection
+from mbtf_fit.pictures import grid, sheet
+from mbtf_fit.pictures.config import SheetSection
 from mbtf_gen.config.pictures import Direction
 
 SECTION = SheetSection(

@@ -15,12 +15,12 @@ import pytest
 from mbtf_core.app.console import run
 from mbtf_core.data.schema import Queries
 from mbtf_core.files import folders
-from mbtf_gen import forecast as module
 from mbtf_gen.cli.app import app
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.forecast import forecast
-from mbtf_gen.job import Job
+from mbtf_gen.planning import forecast as module
 from mbtf_gen.planning import sample_allocation
+from mbtf_gen.planning.forecast import forecast
+from mbtf_gen.planning.job import Job
 from mbtf_gen.planning.run_plan import RunPlan, allocate, plan_effects
 from mbtf_gen.planning.simulation import pilot_queries
 from mbtf_gen.render.estimates import Estimates, Stream

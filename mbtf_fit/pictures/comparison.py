@@ -36,10 +36,9 @@ from mbtf_core.units import tiles_text
 from mbtf_fit.evaluation import check_aspect, foreign_inputs
 from mbtf_fit.formatting import format_estimate, visibility
 from mbtf_fit.material.material import Material
-from mbtf_fit.preview.config import ComparisonConfig
-from mbtf_fit.preview.grid import color_bar, grid, with_bar
+from mbtf_fit.pictures.config import ComparisonConfig
+from mbtf_fit.pictures.grid import color_bar, grid, with_bar
 from mbtf_gen.config.generator import GeneratorConfig
-from mbtf_gen.job import Job
 from mbtf_gen.pictures.reference import (
     cameras_of,
     check_view,
@@ -47,6 +46,7 @@ from mbtf_gen.pictures.reference import (
     picture_names,
     render_missing,
 )
+from mbtf_gen.planning.job import Job
 
 PICTURE_NAME = "comparison.png"
 # Smaller pictures are enlarged to about so many pixels across.

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from mbtf_core.errors import PartialError
-from mbtf_core.locks import brief_lock, shard_lock, take_lock
+from mbtf_core.files.locks import brief_lock, shard_lock, take_lock
 
 
 def lock_of(shard: Path) -> Path:
@@ -55,7 +55,7 @@ def hold(shard: Path) -> subprocess.Popen[bytes]:
     code = f"""
 import sys
 from pathlib import Path
-from mbtf_core.locks import shard_lock
+from mbtf_core.files.locks import shard_lock
 with shard_lock(Path({str(shard)!r})) as held:
     print(held, flush=True)
     sys.stdin.read()
@@ -139,7 +139,7 @@ def test_dates_of_locks_of_other_machines(
         text = lock_of(shard).read_text().replace(socket.gethostname(), "oak")
     plant(shard, text, age)
     now = time.time()
-    monkeypatch.setattr("mbtf_core.locks.time.time", lambda: now - 3e7)
+    monkeypatch.setattr("mbtf_core.files.locks.time.time", lambda: now - 3e7)
     with shard_lock(shard) as held:
         assert held is free
         assert lock_of(shard).exists()
@@ -148,7 +148,7 @@ def test_dates_of_locks_of_other_machines(
 
 @pytest.mark.usefixtures("no_advisory_locks")
 def test_a_living_owner_renews_its_lock(shard: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mbtf_core.locks._RENEWAL_SECONDS", 0.01)
+    monkeypatch.setattr("mbtf_core.files.locks._RENEWAL_SECONDS", 0.01)
     with shard_lock(shard):
         os.utime(lock_of(shard), (0, 0))
         while lock_of(shard).stat().st_mtime == 0:
@@ -162,7 +162,7 @@ def test_a_brief_lock_is_waited_for_but_not_for_ever(shard: Path, monkeypatch: p
     with brief_lock(shard):
         pass
     held = take_lock(shard)
-    monkeypatch.setattr("mbtf_core.locks._PATIENCE_SECONDS", 0.05)
+    monkeypatch.setattr("mbtf_core.files.locks._PATIENCE_SECONDS", 0.05)
     with pytest.raises(PartialError, match=f"process {os.getpid()} on"), brief_lock(shard):
         pass
     held.release()

@@ -20,7 +20,7 @@ from typing import Any
 
 from mbtf_core.errors import EngineError
 from mbtf_core.run.processes import run_child
-from mbtf_gen.checks import Absent, Check
+from mbtf_gen.diagnostics.checks import Absent, Check
 from mbtf_gen.engine.runtime import (
     CACHE_VARIABLE,
     CPU_VARIANT,

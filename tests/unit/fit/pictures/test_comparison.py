@@ -17,7 +17,7 @@ from support.datasets import edit, read_checksummed, write_dataset
 from support.plugin_materials import write_material
 
 from mbtf_core.color import to_display
-from mbtf_fit.preview.grid import CAPTION, GAP, MARGIN
+from mbtf_fit.pictures.grid import CAPTION, GAP, MARGIN
 from mbtf_gen.pictures import reference
 
 VALUE = (0.1, 0.12, 0.15)

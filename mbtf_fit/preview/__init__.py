@@ -1,1 +1,0 @@
-"""``mbtf-fit preview``: a contact sheet of a fitted material, without a scene."""

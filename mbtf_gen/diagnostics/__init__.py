@@ -1,0 +1,1 @@
+"""Diagnosis of an installation: whether each part works here, and whether the physics is right."""
