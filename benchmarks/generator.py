@@ -13,8 +13,7 @@
   tile from straight above, as many paths, the same depth and roulette. Its rays are coherent and all hit: it
   is the renderer's best case, not a goal for random queries.
 
-All reflect by ``mbtf_surface``. Variance × time is that of one query or pixel relative to the squared mean;
-queries and pixels differ, so compare it only within one way.
+All reflect by ``mbtf_surface``.
 
 ``steps`` traces the same queries with one step of light transport after the other: the plane alone, the first
 ray, the ray to the light, light that BSDF sampling finds, and up to six interactions.
@@ -60,8 +59,8 @@ THRESHOLDS = {"generator over mitsuba": 0.75}
 CORES = 2
 
 
-# (seconds, variance over the squared mean of one query or pixel) of a run of a given number.
-Run = Callable[[int], tuple[float, float]]
+# A run of a given number.
+Run = Callable[[int], None]
 
 
 def noise(rng: np.random.Generator, cutoff: float) -> NDArray[np.float64]:
@@ -93,30 +92,24 @@ def query_plan(lattice: Lattice, count: int) -> QueryPlan:
 
 
 def generator_run(scene: TileScene, lattice: Lattice, transport: Transport, count: int, spp: int) -> Run:
-    """A function of the run's number that traces `count` queries."""
+    """A function that traces `count` queries, with the random numbers of a run."""
     from mbtf_gen.render.estimates import Stream
     from mbtf_gen.render.estimator import Estimator
     from mbtf_gen.sampling.light_kernel import LightKernel
 
     estimator = Estimator(scene, LightKernel(LIGHT_WIDTH), transport)
-    plan = query_plan(lattice, count)
+    queries = query_plan(lattice, count).draw("train", 0, count)
 
-    def run(number: int) -> tuple[float, float]:
-        queries = plan.draw("train", number, count)
-        start = time.perf_counter()
+    def run(number: int) -> None:
         estimates = estimator.estimate(queries, spp, Stream(0, "train", number))
-        seconds = time.perf_counter() - start
         if estimates.lost or not estimates.value_a.mean() > 0:
             raise SystemExit("rays were lost, or the picture is black: the figures mean nothing")
-        a, b = estimates.value_a.astype(np.float64), estimates.value_b.astype(np.float64)
-        return seconds, float(np.mean((a - b) ** 2) / np.mean(a + b) ** 2)
 
     return run
 
 
 def mitsuba_run(material: Tile, count: int, spp: int, depth: int, roulette: int) -> Run:
-    """The same for ``mi.render`` and a picture of `count` pixels; `depth` -1 has no limit."""
-    import drjit as dr
+    """The same for ``mi.render`` and a picture of about `count` pixels; `depth` -1 has no limit."""
     import mitsuba as mi
 
     from mbtf_gen.render.scene import unit_of
@@ -149,57 +142,21 @@ def mitsuba_run(material: Tile, count: int, spp: int, depth: int, roulette: int)
             }
         )
 
-    last: NDArray[np.float64] | None = None
-
-    def run(number: int) -> tuple[float, float]:
-        nonlocal last
-        start = time.perf_counter()
-        picture = mi.render(scene, seed=number)
-        dr.eval(picture)
-        dr.sync_thread()
-        seconds = time.perf_counter() - start
-        image = np.array(picture, np.float64)
-        if not image.mean() > 0:
+    def run(number: int) -> None:
+        if not np.array(mi.render(scene, seed=number)).mean() > 0:
             raise SystemExit("the stock picture is black: the figures mean nothing")
-        # From this run's picture and the one before, of other random numbers.
-        variance = (
-            float("nan") if last is None else float(np.mean((image - last) ** 2) / 2 / image.mean() ** 2)
-        )
-        last = image
-        # As if it had exactly as many paths as ours.
-        return seconds * count / (rows * columns), variance
 
     return run
 
 
-def spread(seconds: list[float], paths: int) -> dict[str, float]:
-    """Median, smallest and largest rate in million paths per second."""
-    rates = [paths / s / 1e6 for s in seconds]
-    return {
-        "median": round(statistics.median(rates), 3),
-        "min": round(min(rates), 3),
-        "max": round(max(rates), 3),
-    }
-
-
 def take_turns(ways: Mapping[str, Run], paths: int, rounds: int) -> dict[str, dict[str, float]]:
-    """Million paths per second of each way, printed; the first round, which compiles, is not counted."""
-    seconds: dict[str, list[float]] = {name: [] for name in ways}
-    variances: dict[str, list[float]] = {name: [] for name in ways}
-    for number in range(rounds + 1):
-        for name, run in ways.items():
-            took, variance = run(number)
-            if number:
-                seconds[name].append(took)
-                variances[name].append(variance)
+    """Million paths per second of each way, printed."""
     figures = {}
-    for name in ways:
-        figures[name] = rates = spread(seconds[name], paths)
-        product = statistics.median(seconds[name]) * statistics.mean(variances[name])
-        print(
-            f"{name:9s} {rates['median']:.3g} M paths/s ({rates['min']:.3g} to {rates['max']:.3g}), "
-            f"relative variance x time {product:.3g} s"
-        )
+    for name, seconds in alternate(ways, rounds).items():
+        rates = [paths / s / 1e6 for s in seconds]
+        measures = {"median": statistics.median(rates), "min": min(rates), "max": max(rates)}
+        figures[name] = {key: round(rate, 3) for key, rate in measures.items()}
+        print(f"{name:9s} {measures['median']:.3g} M paths/s ({min(rates):.3g} to {max(rates):.3g})")
     return figures
 
 
@@ -234,15 +191,12 @@ def measure_speed(material: Tile, arguments: argparse.Namespace) -> int:
 
 def measure_steps(material: Tile, arguments: argparse.Namespace) -> int:
     """Time per path with one step of light transport after the other."""
-    from mbtf_gen.render.estimates import Stream
-    from mbtf_gen.render.estimator import Estimator
     from mbtf_gen.render.path_tracer import Transport
     from mbtf_gen.render.scene import build_scene
-    from mbtf_gen.sampling.light_kernel import LightKernel
 
     grid = material.at(arguments.height_scale, MESH).grid
     assert grid is not None
-    tile, light = build_scene(grid, material.surface()), LightKernel(LIGHT_WIDTH)
+    scene = build_scene(grid, material.surface())
     bare: dict[str, Any] = {"shadowing": False, "interreflection": False, "bsdf_sampling": False}
     steps = {
         "plane": Transport(1, displacement=False, **bare),
@@ -251,17 +205,10 @@ def measure_steps(material: Tile, arguments: argparse.Namespace) -> int:
         "light found by BSDF sampling": Transport(1, interreflection=False),
         "up to six interactions": Transport(DEPTH),
     }
-    plan = query_plan(Lattice.for_map(*grid.z.shape), arguments.queries)
-
-    def traced(transport: Transport) -> Callable[[int], Any]:
-        estimator = Estimator(tile, light, transport)
-        return lambda number: estimator.estimate(
-            plan.draw("train", number, arguments.queries), arguments.spp, Stream(0, "train", number)
-        )
-
-    seconds = alternate({name: traced(step) for name, step in steps.items()}, arguments.runs)
+    lattice, sizes = Lattice.for_map(*grid.z.shape), (arguments.queries, arguments.spp)
+    ways = {name: generator_run(scene, lattice, step, *sizes) for name, step in steps.items()}
     before, rows = 0.0, []
-    for name, took in seconds.items():
+    for name, took in alternate(ways, arguments.runs).items():
         each = 1e6 * statistics.median(took) / (arguments.queries * arguments.spp)
         rows.append({"step": name, "million_paths_per_second": 1 / each, "microseconds": each})
         print(f"{name:28s} {1 / each:6.2f} M paths/s  {each:.3f} µs per path, {each - before:+.3f}")
@@ -281,33 +228,29 @@ def measure_lights(material: Tile, arguments: argparse.Namespace) -> int:
     plan, spp = query_plan(material.lattice(), arguments.queries), arguments.spp
     rows: list[dict[str, Any]] = []
     for lights in (1, 2, 4, 8):
-        seconds, squares, correlations = [], [], []
+        seconds, squares = [], []
         for number in range(arguments.runs + 1):
             queries = replace(plan, lights=lights).draw("train", number, arguments.queries)
             began = time.process_time()
             found = estimator.estimate(queries, spp, Stream(lights, "train", number), lights=lights)
             seconds.append(time.process_time() - began)
-            error = (found.value_a.astype(np.float64) - found.value_b).mean(axis=1).reshape(lights, -1) / 2.0
-            square = np.mean(error**2)
-            squares.append(square / np.mean(found.value_a + found.value_b) ** 2 * 4.0)
-            pairs = (np.square(error.sum(axis=0)).mean() / lights - square) / max(lights - 1, 1)
-            correlations.append(pairs / square)
+            error = (found.value_a.astype(np.float64) - found.value_b).mean(axis=1) / 2.0
+            squares.append(np.mean(error**2) / np.mean(found.value_a + found.value_b) ** 2 * 4.0)
         # The first run compiles.
         each = 1e6 * statistics.median(seconds[1:]) / arguments.queries
-        noise, shared = (float(np.mean(x)) for x in (squares, correlations))
+        noise = float(np.mean(squares)) ** 0.5
         ratio = rows[0]["microseconds"] / each if rows else 1.0
         rows.append(
             {
                 "lights": lights,
                 "microseconds": each,
                 "queries per second over one light's": ratio,
-                "relative noise": noise**0.5,
-                "correlation within groups": shared,
+                "relative noise": noise,
             }
         )
         print(
             f"{lights} lights {each:8.2f} µs of processor time per query, {ratio:.2f} times the queries, "
-            f"noise {noise**0.5:.0%} of the mean, correlation {shared:.2f}",
+            f"noise {noise:.0%} of the mean",
             flush=True,
         )
     return finish(rows, {}, None)

@@ -4,9 +4,8 @@
 
 Runs ``mbtf-pipeline run --quality`` in a process of its own: ``draft`` on six texture sets, ``standard`` on
 three of them, ``high`` on one. ``paper`` needs a GPU and is not run. ``--only`` (repeatable) selects single
-runs, also of assets, such as ``turtle_shell:draft``. FOLDER keeps every finished run, so the same command
-resumes; a run is repeated only if its preset has changed since. Each is printed as a row of the
-documentation's table. The last line is one JSON object.
+runs, also of assets, such as ``turtle_shell:draft``. FOLDER keeps the figures of every finished run, so the
+same command resumes. Each is printed as a row of the documentation's table. The last line is one JSON object.
 """
 
 from __future__ import annotations
@@ -16,21 +15,17 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
-from common import HEIGHT_SCALES, finish, is_available, parser_of, source, start
+from common import HEIGHT_SCALES, finish, is_available, kept, parser_of, source, start
 
 from mbtf_core.app.options import Quality
 from mbtf_core.config.settings import resolve
-from mbtf_core.errors import InputError
-from mbtf_core.files.atomic import data_sha256, read_json, write_json
 from mbtf_core.units import clock
-from mbtf_fit.config import FitConfig, fitter_options
 from mbtf_gen.config.generator import GENERATOR, RESOLUTION, GeneratorConfig
-from mbtf_pipeline.recipe import COMPARE
 
 # Texture sets of the longer runs.
 LONGER: dict[Quality, tuple[str, ...]] = {
@@ -49,54 +44,17 @@ fit: {{model: relief}}
 """
 
 
-@dataclass(frozen=True)
-class MeasuredRun:
-    """One material at a preset, from height map to report.
-
-    Attributes
-    ----------
-    height_scale : in tile widths, None for the material's own
-    seconds : of the whole run, start-up included; generate, fit : of these two stages
-    unexplained, unexplained_error : unexplained variance of the test queries and its standard error
-    data_bytes, material_bytes : on disk
-    options_hash : of the preset's options
-    """
-
-    material: str
-    quality: Quality
-    height_scale: float | None
-    seconds: float
-    generate: float
-    fit: float
-    unexplained: float
-    unexplained_error: float
-    data_bytes: int
-    material_bytes: int
-    options_hash: str
-
-    def __str__(self) -> str:
-        scale = "" if self.height_scale is None else f", height scale {self.height_scale:g}"
-        cells = (
-            f"`{self.quality}`",
-            f"{self.material}{scale}",
-            *(clock(seconds) for seconds in (self.seconds, self.generate, self.fit)),
-            f"{self.unexplained:.3f} ± {self.unexplained_error:.3f}",
-            f"{self.data_bytes / 1e6:.0f} MB",
-            f"{self.material_bytes / 1e6:.2f} MB",
-        )
-        return f"| {' | '.join(cells)} |"
-
-
-def options_hash(quality: Quality) -> str:
-    """Hash of all options of a preset and of the fitter's other training options."""
-    options = fitter_options(quality, {"": {}})[""]
-    training = resolve(FitConfig, presets=options).training.model_dump(mode="json")
-    return data_sha256([GENERATOR[quality], options, training, COMPARE[quality]])[:12]
-
-
-def resolution_of(quality: Quality, resolution: int | None) -> int:
-    """Texels across: the given number, or that of the preset."""
-    return int(resolution or GENERATOR[quality][RESOLUTION])
+def row_of(found: Mapping[str, Any]) -> str:
+    """A run as a row of the documentation's table."""
+    scale = "" if found["height_scale"] is None else f", height scale {found['height_scale']:g}"
+    cells = (
+        f"`{found['quality']}`",
+        f"{found['material']}{scale}",
+        *(clock(found[name]) for name in ("seconds", "generate", "fit")),
+        f"{found['unexplained']:.3f} ± {found['unexplained_error']:.3f}",
+        f"{found['material_bytes'] / 1e6:.2f} MB",
+    )
+    return f"| {' | '.join(cells)} |"
 
 
 def generator_config(name: str, quality: Quality, resolution: int, **queries: Any) -> GeneratorConfig:
@@ -114,7 +72,7 @@ def generator_config(name: str, quality: Quality, resolution: int, **queries: An
     )
 
 
-def run(name: str, quality: Quality, resolution: int, work: Path) -> MeasuredRun:
+def run(name: str, quality: Quality, resolution: int, work: Path) -> dict[str, Any]:
     """Run the pipeline on a material, timed from outside, in an empty folder `work`.
 
     Raises
@@ -139,19 +97,17 @@ def run(name: str, quality: Quality, resolution: int, work: Path) -> MeasuredRun
     unexplained = summary["test"]["relief"]["unexplained_variance"]
     if unexplained["value"] is None:
         raise SystemExit(f"{name} at {quality}: the unexplained variance of its test values is undefined")
-    found = MeasuredRun(
-        name,
-        quality,
-        height,
-        round(seconds, 1),
-        round(stages["generate"], 1),
-        round(sum(s for stage, s in stages.items() if stage.startswith("fit")), 1),
-        round(unexplained["value"], 4),
-        round(unexplained["error"], 4),
-        sum(p.stat().st_size for p in (out / "shards").rglob("*") if p.is_file()),
-        sum(p.stat().st_size for p in (out / "fits" / "relief").glob("weights*")),
-        options_hash(quality),
-    )
+    found = {
+        "material": name,
+        "quality": quality,
+        "height_scale": height,
+        "seconds": seconds,
+        "generate": stages["generate"],
+        "fit": sum(s for stage, s in stages.items() if stage.startswith("fit")),
+        "unexplained": unexplained["value"],
+        "unexplained_error": unexplained["error"],
+        "material_bytes": sum(p.stat().st_size for p in (out / "fits" / "relief").glob("weights*")),
+    }
     shutil.rmtree(work)
     return found
 
@@ -175,15 +131,6 @@ def requested(only: Sequence[str] | None) -> list[tuple[str, Quality]]:
     return out
 
 
-def finished(path: Path) -> MeasuredRun | None:
-    """A stored run; None where the file is missing or damaged, or its preset has changed since."""
-    try:
-        found = MeasuredRun(**read_json(path))
-        return found if found.options_hash == options_hash(found.quality) else None
-    except (InputError, TypeError, KeyError):
-        return None
-
-
 def main() -> int:
     parser = parser_of(__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder of the finished runs")
@@ -193,18 +140,14 @@ def main() -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
     runs = []
     for name, quality in requested(arguments.only):
-        resolution = resolution_of(quality, arguments.resolution)
-        path = arguments.out / f"{name}-{quality}-{resolution}.json"
-        found = finished(path)
-        if found is None and is_available(name):
-            found = run(name, quality, resolution, arguments.out / ".work")
-            write_json(path, asdict(found))
-        if found is not None:
-            runs.append(found)
-            print(found, flush=True)
-    timed = [r for r in runs if r.quality in THRESHOLDS and arguments.resolution is None]
-    met = all(r.seconds <= THRESHOLDS[r.quality] for r in timed)
-    return finish({"runs": [asdict(r) for r in runs]}, THRESHOLDS, met)
+        if is_available(name):
+            resolution = int(arguments.resolution or GENERATOR[quality][RESOLUTION])
+            path = arguments.out / f"{name}-{quality}-{resolution}.json"
+            runs.append(kept(path, partial(run, name, quality, resolution, arguments.out / ".work")))
+            print(row_of(runs[-1]), flush=True)
+    timed = [r for r in runs if r["quality"] in THRESHOLDS and arguments.resolution is None]
+    met = all(r["seconds"] <= THRESHOLDS[r["quality"]] for r in timed)
+    return finish({"runs": runs}, THRESHOLDS, met)
 
 
 if __name__ == "__main__":

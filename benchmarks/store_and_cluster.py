@@ -12,8 +12,7 @@ folder, with the queries in memory and streamed. Shards of both must be equal. R
 rounds; the ratio of a copy of the folder to its original states how far they can be trusted.
 
 ``cluster``: start of local Dask workers, time per empty task, overhead of one-second tasks, a data set by one
-process and by the workers. From these it projects the time of ``--library`` materials of ``--paths`` paths
-each, and a fit of ``--fit-seconds`` per material, on 1 to 4096 such workers.
+process and by the workers.
 
 The last line is one JSON object.
 """
@@ -35,8 +34,6 @@ import numpy as np
 import torch
 from common import ASSETS, alternate, finish, parser_of, start, timed
 
-from mbtf_core.data.dataset import Dataset
-from mbtf_core.data.documents import finished_record
 from mbtf_core.data.shard_files import row_bytes, write_shard
 from mbtf_core.data.store import ObjectStore
 from mbtf_core.data.verify import verify
@@ -54,7 +51,6 @@ from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.generation.run import generate
 
 URL = "s3://bucket/data"
-WORKERS = (1, 16, 256, 4096)
 # Paths per query and queries per shard: the defaults.
 SPP, SHARD_QUERIES = 4, 1 << 18
 DISK = {"writing at most": 0.05, "verify over digest at least": 0.8}
@@ -187,13 +183,6 @@ def run_tasks(runner: Runner, count: int, function: TaskFunction, arguments: dic
     return timed(run)
 
 
-def shard_seconds(folder: Path) -> list[float]:
-    """Seconds of each training shard, by its sidecar."""
-    data = Dataset.open(folder)
-    records = [finished_record(data.folder, e, data.manifest["config_hash"]) for e in data.entries("train")]
-    return [record["seconds"] for record in records if record is not None]
-
-
 def writing_rate(folder: Path) -> float:
     """MB/s of writing shards, until they are on the disk."""
     folder.mkdir()
@@ -208,36 +197,8 @@ def writing_rate(folder: Path) -> float:
     return n * row_bytes(False) / 1e6 / float(np.median(seconds))
 
 
-def projected(figures: dict[str, float], options: argparse.Namespace, workers: int) -> dict[str, Any]:
-    """Time of the library on a number of workers, and what it waits for.
-
-    Shards and fits are spread evenly. The scheduler and the storage work beside the workers, so that the
-    slowest of the three decides; start-up and the last fit come on top.
-    """
-    shards = options.library * math.ceil(options.paths / (SPP * SHARD_QUERIES))
-    queries = options.library * options.paths / SPP
-    rendering = options.library * options.paths / figures["paths/s of a worker"]
-    fitting = options.library * options.fit_seconds
-    bounds = {
-        "workers": (rendering + fitting) / workers,
-        "scheduler": (shards + options.library) * figures["seconds per empty task"],
-        "storage": queries * row_bytes(False) / 1e6 / options.storage,
-    }
-    slowest = max(bounds, key=lambda name: bounds[name])
-    start = figures["seconds of a worker's start"] + figures["seconds before its first shard"]
-    tail = options.fit_seconds if workers > 1 else 0.0
-    seconds = start + bounds[slowest] + tail
-    return {
-        "workers": workers,
-        "seconds": round(seconds),
-        "worker hours": round(workers * seconds / 3600, 1),
-        "efficiency": round(bounds["workers"] / seconds, 3),
-        "limited by": slowest,
-    }
-
-
 def measure_cluster(options: argparse.Namespace) -> int:
-    """Overhead of workers, and the projected time of a library."""
+    """Overhead of workers."""
     figures: dict[str, float] = {}
     config = config_of(options.material, options.queries)
     with tempfile.TemporaryDirectory() as name:
@@ -255,29 +216,12 @@ def measure_cluster(options: argparse.Namespace) -> int:
             figures["overhead of one-second tasks"] = round(each / ideal - 1.0, 4)
             clustered = timed(lambda: generate(config, folder / "cluster", runner=runner))
         plain = timed(lambda: generate(config, folder / "plain"))
-        seconds = shard_seconds(folder / "cluster")
         figures["data set by one process, s"] = round(plain, 2)
         figures["data set by the workers, s"] = round(clustered, 2)
-        median = float(np.median(seconds))
-        figures["seconds of a shard on a worker"] = round(median, 3)
-        figures["seconds before its first shard"] = round(clustered - sum(seconds) / options.workers, 2)
-        figures["paths/s of a worker"] = round(SPP * SHARD_QUERIES / median)
-        figures["MB/s of writing"] = round(writing_rate(folder / "writing"), 1)
-    if options.storage is None:
-        options.storage = figures["MB/s of writing"]
     for key, value in figures.items():
         print(f"{key:34} {value:12,.6g}")
-    table = [projected(figures, options, workers) for workers in WORKERS]
-    load = f"{options.paths:.3g} paths and a fit of {options.fit_seconds:g} s each"
-    print(f"\n{options.library} materials, {load}:")
-    for row in table:
-        print(
-            f"{row['workers']:5} workers: {clock(row['seconds']):>10}, "
-            f"{row['worker hours']:8,.1f} worker hours, "
-            f"efficiency {row['efficiency']:.0%}, limited by: {row['limited by']}"
-        )
     met = figures["overhead of one-second tasks"] <= 0.05
-    return finish({**figures, "projection": table}, CLUSTER, met)
+    return finish(figures, CLUSTER, met)
 
 
 def main() -> int:
@@ -290,10 +234,6 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--tasks", type=int, default=60, help="one-second tasks")
     parser.add_argument("--empty", type=int, default=2000, help="empty tasks")
-    parser.add_argument("--library", type=int, default=1000, help="materials of the projection")
-    parser.add_argument("--paths", type=float, default=1e8, help="paths per material")
-    parser.add_argument("--fit-seconds", type=float, default=600.0, help="training per material")
-    parser.add_argument("--storage", type=float, help="MB/s of the shared storage; default: as measured here")
     options = parser.parse_args()
     measure = {"disk": measure_disk, "store": measure_store, "cluster": measure_cluster}
     return measure[options.part](options)
