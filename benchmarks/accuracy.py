@@ -1,6 +1,6 @@
 """Accuracy of the generator's values: error at equal time, and runs with a target error.
 
-    python benchmarks/accuracy.py [equal-time] [NAME ...] [--queries 65536] [--spp 16] [--repeats 4]
+    python benchmarks/accuracy.py [equal-time [NAME ...]] [--queries 65536] [--spp 16] [--repeats 4]
     python benchmarks/accuracy.py target [MATERIAL ...] [--target 0.05] [--queries 1500] [--max-spp N]
 
 ``equal-time`` compares with plain independent sampling on three texture sets. All ways trace the same paths

@@ -30,14 +30,6 @@ def test_help_answers_without_heavy_modules(program: str, run_python: RunPython)
     done = run_python("-c", code, COLUMNS="80")
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
-    text, _, loaded = done.stdout.rpartition("loaded:")
+    shown, _, loaded = done.stdout.rpartition("loaded:")
     assert loaded.split() == []
-    whole, *commands = text.split("command: ")
-    assert f"Usage: {program}" in whole
-    assert "--version" in whole
-    assert len(commands) > 3
-    # One screen, with two examples.
-    assert len(whole.splitlines()) <= 50
-    assert whole.count(f" • {program} ") == 2
-    for answer in commands:
-        assert f"Usage: {program} {answer.split()[0]}" in answer
+    assert shown.count(f"Usage: {program}") == 1 + shown.count("command: ") > 4

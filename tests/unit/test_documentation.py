@@ -26,20 +26,6 @@ def test_every_file_that_pages_name_exists() -> None:
     assert [(page, name) for page, name in sorted(named) if not any(ROOT.glob(where[name]))] == []
 
 
-def test_every_equation_is_linked_to_a_file_that_has_its_label() -> None:
-    page = DOCS / "explanation" / "models.md"
-    text = page.read_text()
-    labels = set(re.findall(r"\\text\{\((\w\d)\)\}", text))
-    linked = {
-        label: page.parent.joinpath(path).resolve()
-        for names, path in re.findall(r"\[((?:\w\d(?:, )?)+)\]\(([^)]+\.py)\)", text)
-        for label in names.split(", ")
-    }
-    assert labels
-    assert labels == set(linked)
-    assert {label for label, path in linked.items() if path.read_text().count(f"({label})") != 1} == set()
-
-
 def test_tables_are_up_to_date(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of options, stored arrays and operations."""
     monkeypatch.syspath_prepend(str(DOCS / "extensions"))

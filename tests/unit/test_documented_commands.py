@@ -122,25 +122,6 @@ def test_every_command_that_is_shown_can_be_given(tmp_path: Path, monkeypatch: p
     assert faults == []
 
 
-def test_an_option_has_one_help_and_one_meaning() -> None:
-    helps: dict[str, set[str | None]] = {}
-    keys: dict[str, set[str]] = {}
-    for app in APPS.values():
-        for command in commands(app).values():
-            for argument in command.assemble_argument_collection(parse_docstring=True):
-                for name in argument.names:
-                    if name.startswith("--"):
-                        helps.setdefault(name, set()).add(argument.parameter.help)
-            for option in getattr(options_of(command.default_command), "table", ()):
-                keys.setdefault(option.flag, set()).add(option.key.rpartition(".")[2].removesuffix("s"))
-    # Paths per query or per pixel.
-    assert len(helps.pop("--spp")) == 2
-    # Only data sets are written to URLs.
-    assert helps.pop("--output") == {"Output folder.", "Output folder or URL."}
-    assert {name: found for name, found in helps.items() if len(found) > 1 or not all(found)} == {}
-    assert {flag: found for flag, found in keys.items() if len(found) > 1} == {}
-
-
 def pages_in_order() -> list[Path]:
     """README, then the pages that a reader follows, in the order of the table of contents."""
     names = re.findall(r"^(?:start|how-to)/[\w-]+$", (ROOT / "docs/index.md").read_text(), re.MULTILINE)

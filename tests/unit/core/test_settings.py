@@ -42,23 +42,6 @@ def write(tmp_path: Path) -> Any:
     return write
 
 
-def test_flags_win_over_assignments_over_the_file(write: Any) -> None:
-    path = write("height: 0.1\nlevels: 3\nlight:\n  width_deg: 2\n")
-    assert resolve(Whole, file=path).height == 0.1
-    assignments = ["height=0.2", "levels=4", "light.width_deg=5"]
-    whole = resolve(Whole, file=path, assignments=assignments, flags={"height": 0.3, "levels": None})
-    assert (whole.height, whole.levels, whole.light.width_deg) == (0.3, 4, 5.0)
-
-
-def test_an_option_of_the_command_line_replaces_what_excludes_it(write: Any) -> None:
-    path = write("stages: [{name: a}]\nheight: 0.1\n")
-    for given in ({"assignments": ["levels=4"]}, {"flags": {"levels": 4}}):
-        whole = resolve(Whole, file=path, **given)
-        assert (whole.levels, whole.stages, whole.height) == (4, (), 0.1)
-    whole = resolve(Whole, presets={"levels": 4}, assignments=["stages=[{name: b}]"])
-    assert (whole.levels, whole.stages) == (None, (Stage(name="b"),))
-
-
 def test_assignments_are_read_as_yaml_and_later_ones_win() -> None:
     assignments = ["stages=[{name: a, spp: 4}]", "levels=null", "height=1e-6"]
     assignments += ["light.width_deg=5", "light.width_deg=6", "light.kind=delta"]

@@ -6,17 +6,7 @@ import math
 
 from mbtf_core.stats import Estimate
 from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_METRICS, available_metrics
-from mbtf_pipeline.tables import data_errors, decibel, estimate_text
-
-
-def test_values_within_two_error_bars_are_marked() -> None:
-    for value in (0.03, -0.03, 0.0):
-        text = estimate_text(Estimate(value, 0.02, 100))
-        assert text.startswith("not significant (")
-        assert "± 0.02" in text
-    assert estimate_text(Estimate(0.123, 0.004, 100), 100.0) == "12.3 ± 0.4"
-    assert estimate_text(Estimate(-0.123, 0.004, 100)) == "−0.123 ± 0.004"
-    assert estimate_text(Estimate(math.nan, math.inf, 1)) == "undefined"
+from mbtf_pipeline.tables import data_errors, decibel
 
 
 def test_each_error_of_the_same_queries_is_marked_by_its_own_bar() -> None:
@@ -46,9 +36,8 @@ def test_psnr_of_an_insignificant_error_is_marked() -> None:
 
 
 def test_perceptual_differences_that_noise_explains() -> None:
+    """A larger SSIM is a smaller difference."""
     _, hdr, ssim, learned = PERCEPTUAL_METRICS
-    assert [hdr.text(value, 0.1) for value in (0.09, 0.2)] == ["0.090, within noise (0.100)", "0.200"]
-    # A larger SSIM is a smaller difference.
     assert [ssim.text(value, 0.9) for value in (0.93, 0.8)] == ["0.930, within noise (0.900)", "0.800"]
     record = {"flip": {"hdr": 0.2}, "ssim": 0.8, "st_lpips": None}
     assert (hdr.of(record), learned.text(learned.of(record), None)) == (0.2, "–")

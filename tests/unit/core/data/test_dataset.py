@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 import shutil
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.datasets import FOREIGN, NOISE, formula, rewrite, write_dataset
+from support.paths import ROOT
 
 from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.schema import Queries
@@ -35,6 +37,17 @@ def test_shuffled_layout(tmp_path: Path, array_format: str) -> None:
     expected = pooled_error(test["value_a"], test["value_b"]).value
     assert np.sqrt(np.mean(error**2)) == pytest.approx(expected, rel=0.1)
     assert np.abs(error).max() < 6 * NOISE
+
+
+@pytest.mark.parametrize("layout", ["shuffled", "image"])
+def test_the_reader_of_the_documentation_reads_what_is_written(tmp_path: Path, layout: str) -> None:
+    queries = {"train": "160", "test": "64", "layout": layout}
+    data = write_dataset(tmp_path / "shards", queries=queries, output=OUTPUT)
+    read_split = runpy.run_path(str(ROOT / "examples/read_data.py"))["read_split"]
+    for split in ("train", "test"):
+        expected, found = data.load(split), read_split(str(data.folder), split)
+        assert set(found) == set(expected)
+        assert all(np.array_equal(found[name], expected[name]) for name in expected)
 
 
 @pytest.mark.parametrize("suffix", ["npz", "json"])

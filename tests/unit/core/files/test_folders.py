@@ -9,18 +9,16 @@ import resource
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from mbtf_core.errors import InputError, PartialError
-from mbtf_core.files import editable, folders
+from mbtf_core.files import editable
 from mbtf_core.files.editable import write_document
 from mbtf_core.files.folders import (
     OutputFolder,
     OutputKind,
-    check_space,
     owned,
 )
 
@@ -45,14 +43,6 @@ def test_one_command_owns_a_folder(tmp_path: Path) -> None:
     with owned(folder):
         pass
     assert folder.exists(), "it was there before"
-
-
-def test_what_does_not_fit_on_the_disk_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(folders.shutil, "disk_usage", lambda path: SimpleNamespace(free=3e9))
-    check_space(tmp_path / "new" / "folder", 3e9, "hint")
-    with pytest.raises(InputError, match=r"new/folder: needs 27 GB; 3.0 GB are free\n  reduce --queries"):
-        check_space(tmp_path / "new" / "folder", 27e9, "reduce --queries")
-    assert not (tmp_path / "new").exists()
 
 
 def test_a_full_disk_leaves_neither_lock_nor_folder(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.material_cases import make
+from support.material_cases import ALL, make
 from support.plugin_materials import write_material
 
 from mbtf_core.app.console import CONSOLE
@@ -19,11 +19,12 @@ from mbtf_fit.material.material import export
 from mbtf_fit.material.numpy_reader import NumpyMaterial
 from mbtf_fit.material.rounding import round_material
 from mbtf_fit.material.texture_formats import TextureFormat
+from mbtf_fit.models.registry import MODELS
 
 F64 = NDArray[np.float64]
 
 
-# Every operation is read in test_read_material.py; these differ in what the files hold.
+# Every operation is read below; these differ in what the files hold.
 CASES = (
     "calibrated",
     "holes",
@@ -116,3 +117,17 @@ def test_numbers_beyond_half_precision_are_refused(tmp_path: Path) -> None:
         round_material(
             write_material(tmp_path, network={"output_transform": "identity"}, contrast=1e5), "float16"
         )
+
+
+@pytest.mark.parametrize("case", ALL)
+def test_the_reader_gives_the_conformance_values(case: str, tmp_path: Path) -> None:
+    material = make(case, tmp_path / "material")
+    expected = material.conformance["rgb"]
+    queries = [material.conformance[name] for name in ("u", "sigma", "omega_i", "omega_o")]
+    found = NumpyMaterial.load(tmp_path / "material").evaluate(*queries)
+    assert (expected.std() > 0) == (case != "black")
+    np.testing.assert_array_less(abs(found - expected), 1e-4 * np.maximum(1.0, expected))
+
+
+def test_every_model_is_read() -> None:
+    assert {options.get("model", "neumip") for options in ALL.values()} == set(MODELS)

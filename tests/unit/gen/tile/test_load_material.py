@@ -17,7 +17,6 @@ from support.paths import ROOT
 from mbtf_core.color import srgb_to_linear
 from mbtf_core.errors import InputError
 from mbtf_gen.tile.loading import latest_material, load_material
-from mbtf_gen.tile.maps.file_names import GLOSS_WORDS, LETTERS, SMOOTHNESS_IN_ALPHA, WEAK_WORDS, WORDS
 
 
 def png(path: Path, codes: NDArray[Any]) -> Path:
@@ -195,9 +194,3 @@ def test_the_example_is_valid(tmp_path: Path) -> None:
     material = load_material(tmp_path)
     assert np.array_equal(material.height, layers["displacement.Y"])
     assert material.height_scale == 0.12
-
-
-def test_every_word_is_listed() -> None:
-    words = [word for table in (WORDS, WEAK_WORDS) for words in table.values() for word in words]
-    for word in (*words, *GLOSS_WORDS, *LETTERS, *SMOOTHNESS_IN_ALPHA):
-        assert f"`{word}`" in DOCUMENT.lower(), word
