@@ -10,7 +10,6 @@ from collections.abc import Generator
 from pathlib import Path
 
 from mbtf_core.errors import InputError, LockedError, PartialError
-from mbtf_core.run.task import worker_threads
 
 
 def double(x: int) -> int:
@@ -72,11 +71,6 @@ def alone() -> bool:
     alone = _running == 1
     _running -= 1
     return alone
-
-
-def threads() -> tuple[int | None, str | None]:
-    """Threads that the worker states."""
-    return worker_threads(), os.environ.get("OMP_NUM_THREADS")
 
 
 def wait_long(mark: str) -> None:

@@ -13,22 +13,14 @@ from mbtf_core.stats.estimate import checked, group_labels
 
 Kind = Literal["mean", "scatter"]
 
-# Below this many independent units the t distribution of heavy-tailed noise is not trusted.
-_MINIMUM = 1000
-
 
 def holm(p_values: ArrayLike) -> NDArray[np.float64]:
     """p-values corrected for their number by Holm's step-down rule (1979). Any shape.
 
     Bounds the familywise error rate for any dependence between the tests; at least as powerful as Bonferroni.
-
-    Raises
-    ------
-    ValueError : a p-value lies outside [0, 1]
     """
     p = np.asarray(p_values, np.float64)
-    if not np.all((p >= 0) & (p <= 1)):
-        raise ValueError("p-values must lie in [0, 1]")
+    assert np.all((p >= 0) & (p <= 1))
     flat = p.ravel()
     order = np.argsort(flat, kind="stable")
     out = np.empty_like(flat)
@@ -87,7 +79,7 @@ def aggregate_test(
     b2: ArrayLike,
     groups: ArrayLike | None = None,
     *,
-    minimum: int = _MINIMUM,
+    minimum: int = 1000,
 ) -> Aggregate:
     """Compare two data sets at the same queries, by group and channel, corrected for the number of tests.
 
@@ -105,33 +97,23 @@ def aggregate_test(
     groups : (n,) int array_like or None
         Labels; one group by default. Rows with negative labels are ignored.
     minimum : smallest number of units per group, below which heavy tails invalidate the t distribution
-
-    Raises
-    ------
-    ValueError : shapes differ, there is no group, or a group has fewer than `minimum` units
     """
     arrays = [checked(array, name) for array, name in ((a1, "a1"), (b1, "b1"), (a2, "a2"), (b2, "b2"))]
-    if len({array.shape for array in arrays}) > 1:
-        raise ValueError(f"the halves have different shapes: {', '.join(str(x.shape) for x in arrays)}")
+    assert len({array.shape for array in arrays}) == 1
     shape = arrays[0].shape
     arrays = [x.reshape(len(x), -1, shape[-1] if len(shape) > 1 else 1) for x in arrays]
     labels = np.zeros(shape[0], np.int64) if groups is None else group_labels(groups, shape[0])
     found: list[tuple[int, int, Kind, Outcome]] = []
     for label in np.unique(labels[labels >= 0]):
         halves = [array[labels == label] for array in arrays]
-        if len(halves[0]) < minimum:
-            raise ValueError(
-                f"group {label} has {len(halves[0])} units, fewer than {minimum}: "
-                "merge groups or lower `minimum`"
-            )
+        assert len(halves[0]) >= minimum, f"group {label} has {len(halves[0])} units: merge groups"
         for c in range(halves[0].shape[-1]):
             x1, y1, x2, y2 = (half[..., c] for half in halves)
             # The two noises add, each with its own degrees of freedom.
             mean = t_test(mean_of_halves(x1, y1), mean_of_halves(x2, y2))
             scatter = t_test(mean_estimate((x1 - x2) * (y1 - y2)), 0.0, "greater")
             found += [(int(label), c, "mean", mean), (int(label), c, "scatter", scatter)]
-    if not found:
-        raise ValueError("no group to compare")
+    assert found
     corrected = holm([outcome.p_value for *_, outcome in found])
     return Aggregate(
         tuple(

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.mitsuba_blocks import instances
+from support.mitsuba_shapes import mitsuba_shapes
 from support.scenes import (
     DIRECT,
     Estimator,
@@ -235,32 +236,15 @@ def test_the_tile_repeats(aspect: float) -> None:
         assert value.mean() == pytest.approx(found[0].mean(), rel=5e-3)
 
 
-def write_curves(file: Path, curves: Sequence[Curve], unit: float) -> str:
-    """A text file for Mitsuba, centered."""
-    runs = [(curve.unrolled() - (0.5, 0.5, 0.0, 0.0)) * unit for curve in curves]
-    text = "\n\n".join("\n".join(" ".join(f"{c:.9g}" for c in row) for row in run) for run in runs)
-    file.write_text(text + "\n")
-    return str(file)
-
-
 def test_fibers_agree_with_instances_in_unmodified_mitsuba(tmp_path: Path) -> None:
     tile = felt(60, 0.015, ((0.95, 0.5, 0.05), (0.05, 0.5, 0.95)))
     unit = 32.0
-    # A shape of its own for each color: Mitsuba's texture coordinates run around the fiber.
-    shapes = {}
-    for k in range(2):
-        curves = [tile.curves[number] for number in np.flatnonzero(tile.yarn == k)]
-        shapes[f"color_{k}"] = {
-            "type": "bsplinecurve",
-            "filename": write_curves(tmp_path / f"{k}.txt", curves, unit),
-            "bsdf": replace(tile, colors=tile.colors[[k]]).surface(),
-        }
     omega_i = direction(50, 25)
     scene = mi.load_dict(
         {
             "type": "scene",
             "integrator": {"type": "path", "max_depth": -1, "rr_depth": 1000, "hide_emitters": True},
-            "group": {"type": "shapegroup", **shapes},
+            "group": {"type": "shapegroup", **mitsuba_shapes(tile, unit, tmp_path, {})},
             **instances(unit, unit),
             "light": directional(omega_i),
             "sensor": {

@@ -75,18 +75,6 @@ def test_sunk_texture_is_seen_displaced(azimuth: float, axis: int, sign: int) ->
     assert np.sign(seen - u[axis]) == sign
 
 
-def test_picture_shows_the_map_the_right_way_up() -> None:
-    """Seen from above, a picture of one tile is the map: row 0 on top, column 0 on the left."""
-    camera = Camera(
-        90.0, -90.0, 1.0, (0.5, 0.5 * ASPECT), rows=ROWS * 8, columns=COLUMNS * 8, field_of_view=2.0
-    )
-    q = camera.queries(np.array(UP), ASPECT)
-    expected = texel_centers(ROWS * 8, COLUMNS * 8)
-    assert np.abs(q.u - expected).max() < 1e-3
-    # A pixel's footprint: half the pitch of pixels.
-    np.testing.assert_allclose(q.sigma, 0.5 / (COLUMNS * 8), rtol=1e-2)
-
-
 def test_pixel_kind_and_query_kind_agree_from_above() -> None:
     """At normal incidence both kinds of picture of an asymmetric textured height field agree."""
     from support.scenes import rocks
