@@ -48,9 +48,11 @@ def test_presets_keep_what_sections_set() -> None:
     single = config_of("--quality", "draft", "--set", "training.batch=50")
     assert config_of("--quality", "draft", "--set", "training={batch: 50}") == single
     assert (single.training.time, single.network.width) == (TimeBudget(12.0, 800), 40)
-    # An explicit time is the time.
+    # An explicit time is the time, also in place of a preset number of steps.
     for words in (("--time", "5s"), ("--set", "training={time: 5s}")):
         assert config_of("--quality", "draft", *words).training.time == TimeBudget(5.0)
+        training = config_of("--quality", "paper", *words).training
+        assert (training.time, training.steps) == (TimeBudget(5.0), None)
 
 
 def test_durations_are_read() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import runpy
 import shutil
 from pathlib import Path
@@ -48,6 +49,20 @@ def test_the_reader_of_the_documentation_reads_what_is_written(tmp_path: Path, l
         expected, found = data.load(split), read_split(str(data.folder), split)
         assert set(found) == set(expected)
         assert all(np.array_equal(found[name], expected[name]) for name in expected)
+
+
+def test_the_documentation_explains_every_key(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "shards", queries={"train": "160", "test": "64"}, output=OUTPUT)
+    page = (ROOT / "docs/reference/data-format.md").read_text(encoding="utf-8")
+    manifest, sidecar = data.manifest, data.shards("train")[0].sidecar
+    split, levels, effects = manifest["splits"]["train"], manifest["levels"], manifest["effects"]
+    parts = [manifest[name] for name in ("tile", "geometry", "summary")]
+    parts += [split, split["shards"][0], levels, levels["mixture"], effects, effects["effects"][0]]
+    parts += [manifest["arrays"]["u"], sidecar["seed"], sidecar["statistics"]]
+    _, of_manifest, of_sidecar = re.split(r"^## (?:Manifest|Sidecar)$", page, flags=re.M)
+    assert [key for part in (manifest, *parts) for key in part if f"`{key}`" not in page] == []
+    assert [key for key in manifest if f"`{key}`" not in of_manifest] == []
+    assert [key for key in (*sidecar, *sidecar["quarantined"]) if f"`{key}`" not in of_sidecar] == []
 
 
 @pytest.mark.parametrize("suffix", ["npz", "json"])

@@ -59,6 +59,15 @@ def test_a_damaged_image(
     read(folder, name, content)
 
 
+def test_damaged_pixels_of_tiff_files_are_read_in_silence(
+    samples: dict[str, dict[str, bytes]], folder: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for name, content in samples["tif"].items():
+        for at in (int(share * len(content)) for share in (0.3, 0.6, 0.9)):
+            read(folder, name, content[:at] + bytes([content[at] ^ 0x55]) + content[at + 1 :])
+    assert capfd.readouterr() == ("", "")
+
+
 SIDE = 60_000
 # MiB that reading all of them may take: of memory (a library loads tables, but no picture), and of addresses
 # (threads reserve some without using them; a claim of 60000 x 60000 asks for 3400 at least).
