@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.command_lines import call
+from support.commands import call
 from support.datasets import write_dataset
 from support.fit_data import parallax, write_data
 from support.plugin_materials import write_material

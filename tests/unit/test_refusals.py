@@ -13,7 +13,7 @@ import pytest
 from cyclopts import App
 from pydantic import BaseModel, TypeAdapter, ValidationError
 from pydantic.fields import FieldInfo
-from support.command_lines import call
+from support.commands import call
 
 import mbtf_fit.cli.app
 import mbtf_gen.cli.app

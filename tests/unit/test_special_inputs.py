@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.command_lines import call
+from support.commands import call
 from support.fit_data import constant, write_data
 
 

@@ -7,8 +7,7 @@ import math
 from pathlib import Path
 
 import pytest
-from support.command_lines import call
-from support.commands import run_all
+from support.commands import call, run_all
 from support.fit_data import parallax, write_data
 from support.measured_files import photographs, write_folder
 

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from support.command_lines import call
+from support.commands import call
 from support.datasets import edit
 from support.fit_data import constant, parallax, write_data
 

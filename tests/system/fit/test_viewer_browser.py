@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.browser import Page
 from support.material_cases import CASES, make
 from support.plugin_materials import write_material
-from support.viewer_page import Page
 
 from mbtf_core.directions import from_angles
 from mbtf_core.pictures import Camera

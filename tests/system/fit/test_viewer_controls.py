@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.browser import Page
 from support.plugin_materials import write_material
-from support.viewer_page import Page
 
 from mbtf_core.color import linear_to_srgb, srgb_to_linear
 from mbtf_core.data.lattice import Lattice

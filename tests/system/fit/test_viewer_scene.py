@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.browser import Page
 from support.material_cases import make
-from support.viewer_page import Page
 
 from mbtf_core.directions import from_angles
 from mbtf_core.pictures import Camera

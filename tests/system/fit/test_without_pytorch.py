@@ -8,7 +8,7 @@ from typing import Any
 
 from conftest import RunPython
 from PIL import Image
-from support.command_lines import call, fails
+from support.commands import call, fails
 from support.paths import ROOT
 from support.plugin_materials import write_material
 

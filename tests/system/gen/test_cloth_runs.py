@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from support.command_lines import call
-from support.commands import Done, run_named
+from support.commands import Done, call, run_named
 
 from mbtf_core.data.dataset import Dataset
 

@@ -12,8 +12,7 @@ import support.scenes  # noqa: F401  # loads Mitsuba
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 from scipy.stats import spearmanr
-from support.command_lines import call, fails
-from support.commands import Done
+from support.commands import Done, call, fails
 from support.datasets import edit, read_checksummed, write_dataset
 from support.plugin_materials import write_material
 

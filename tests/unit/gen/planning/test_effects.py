@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.command_lines import call
+from support.commands import call
 from support.jobs import height_field, job_of
 
 from mbtf_core.errors import UsageError
