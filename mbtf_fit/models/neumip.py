@@ -16,6 +16,7 @@ Deviations from the paper:
 - The offset network's output r is scaled by 0.1 and the offset texture starts at zero, as in the published
   code.
 - The tile may be non-square, r is a length in tile widths: the v-component is divided by the aspect.
+- Losses, blur, decay of texels and calibration: see docs/explanation/training.md.
 - Directions outside the upper hemisphere are undefined; the caller ensures z > 0.
 """
 

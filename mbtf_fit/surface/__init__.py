@@ -1,1 +1,1 @@
-"""What is known of the surface of a displaced tile: intersections, horizons, and prefiltered maps."""
+"""What is known of the surface: heights, horizons, facets, prefiltered maps; lookups in textures."""

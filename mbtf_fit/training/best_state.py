@@ -3,7 +3,8 @@
 A fit that overfits is best before its end. Its last state is replaced only where an earlier one is better
 beyond noise and by a twentieth, by the difference of both errors on the same validation queries, whose noise
 mostly cancels. So the choice among states hardly biases the errors that are reported, and other fits are as
-they were.
+they were. A last state that is worse than the mean value is replaced by an earlier one that is better: a
+single false glint makes a difference of one standard error, however bright it is.
 
 Rare highlights are learned from single queries, and recur as false glints at directions between. Validation
 finds out what is lost by a lower bound of the values, and what by the glints.
@@ -78,13 +79,15 @@ def overfits(
     best: Sequence[NDArray[np.float32]],
     subsets: Sequence[ShardQueries],
 ) -> bool:
-    """Whether predictions are worse than the best ones, beyond noise and by a twentieth of the error."""
+    """Whether predictions are worse than the best ones, beyond noise and by a twentieth of the error, or
+    worse than the mean value, which the best ones are not."""
     excess = excess_error(predictions, best, subsets)
-    errors = [
+    least = sum(
         noise_free_mse(prediction, *queries.halves).value / _unit(queries)
         for prediction, queries in zip(best, subsets, strict=True)
-    ]
-    return excess.value > max(_SIGNIFICANT * excess.error, _LEAST * sum(errors))
+    )
+    significant = excess.value > max(_SIGNIFICANT * excess.error, _LEAST * least)
+    return significant or least < len(subsets) <= least + excess.value
 
 
 def lower_bound(trainer: Trainer, queries: ShardQueries, prediction: NDArray[np.float32]) -> None:

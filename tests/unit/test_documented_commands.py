@@ -95,8 +95,8 @@ def check_values(command: Any, arguments: dict[str, Any]) -> None:
     """
     options = arguments.get("options", options_of(command))
     if hasattr(options, "table"):
-        if options.config is not None and not (ROOT / options.config).exists():
-            options = replace(options, config=None)
+        # A configuration that an earlier command writes, which this one reads.
+        options = replace(options, config=None)
         arguments_of = {"material", "shards"} & options.configuration.model_fields.keys()
         options.resolve(**dict.fromkeys(arguments_of, "X"))
     if arguments.get("assignments"):

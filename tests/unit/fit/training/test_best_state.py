@@ -164,6 +164,12 @@ def test_the_excess_is_paired_and_relative_to_the_variance() -> None:
     # Significant differences below a twentieth of the error do not count.
     for offset, worse in ((0.0101, False), (0.0105, True)):
         assert overfits([np.float32(true + offset)], [far], [queries]) is worse
+    # A glint is not significant, but worse than the mean value; a dimmer one is not.
+    glint = near.copy()
+    for brightness, worse in ((1.5, True), (0.5, False)):
+        glint[0] = near[0] + brightness * math.sqrt(len(true) * true.var(0).mean())
+        assert excess_error([glint], [near], [queries]).error > 0.3 * brightness**2
+        assert overfits([glint], [near], [queries]) is worse
     # Two materials of other units, of which one is worse and one as much better.
     other = replace(queries, value_a=7 * queries.value_a, value_b=7 * queries.value_b)
     both = excess_error([far, 7 * near], [near, 7 * far], [queries, other])
