@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from mbtf_core.stats import SIGNIFICANT
 from mbtf_core.units import clock
 
 SPLIT_NAMES = {
@@ -30,8 +31,6 @@ _DECISIVE, _MANY = 1 / 3, 1000
 _OUTLYING = 0.25
 # Colors that make this share of the variance are missed where so much of them is unexplained.
 _COLORED, _UNLEARNED = 0.02, 0.5
-# Standard errors of a significant difference from zero.
-_SIGNIFICANT = 2.0
 
 
 def visibility(split: Mapping[str, Any]) -> tuple[str, str | None]:
@@ -42,8 +41,8 @@ def visibility(split: Mapping[str, Any]) -> tuple[str, str | None]:
     mse, error = split["mse"]["value"], split["mse"]["error"]
     if mse is None or error is None:
         return "PSNR unknown", None
-    resolved = mse > _SIGNIFICANT * error
-    squared = mse if resolved else mse + _SIGNIFICANT * error
+    resolved = mse > SIGNIFICANT * error
+    squared = mse if resolved else mse + SIGNIFICANT * error
     if squared <= 0:
         return "PSNR infinite", VISIBILITY[0][1]
     psnr = 10.0 * math.log10(white_of(split["exposure"]) ** 2 / squared)
@@ -124,7 +123,7 @@ def outliers(split: Mapping[str, Any]) -> list[str]:
 def above_one(unexplained: Mapping[str, Any]) -> list[str]:
     """The remark on an unexplained variance that is significantly above 1."""
     value, error = unexplained["value"], unexplained["error"]
-    return [ABOVE_ONE] if value is not None and value - _SIGNIFICANT * (error or 0.0) >= 1.0 else []
+    return [ABOVE_ONE] if value is not None and value - SIGNIFICANT * (error or 0.0) >= 1.0 else []
 
 
 def _remarks(errors: Mapping[str, Any], foreign: bool) -> list[str]:
@@ -139,7 +138,7 @@ def _remarks(errors: Mapping[str, Any], foreign: bool) -> list[str]:
     found += outliers(split)
     color = split["color"]
     known = color.get("share", 0.0) >= _COLORED and color["value"] is not None
-    if known and color["value"] - _SIGNIFICANT * (color["error"] or 0.0) > _UNLEARNED:
+    if known and color["value"] - SIGNIFICANT * (color["error"] or 0.0) > _UNLEARNED:
         found.append(f"colors are hardly learned: {format_estimate(color)} of their variance is unexplained")
     return found if foreign else [*found, *above_one(split["unexplained"])]
 

@@ -9,19 +9,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from mbtf_core.stats import Estimate
+from mbtf_core.stats import SIGNIFICANT, Estimate, is_significant
 
-# A value is significant if it differs from zero by more than so many standard errors.
-SIGNIFICANT = 2.0
 NOT_SIGNIFICANT = "not significant"
 
 
 estimate = Estimate.from_dict
-
-
-def is_significant(e: Estimate) -> bool:
-    """Whether a value differs from zero by more than two standard errors; values not finite count as such."""
-    return not math.isfinite(e.value) or abs(e.value) > SIGNIFICANT * e.error
 
 
 def estimate_text(e: Estimate, factor: float = 1.0) -> str:
@@ -96,7 +89,7 @@ Cell = Estimate | Shown | float | int | str | None
 
 @dataclass(frozen=True)
 class Column:
-    """A column.
+    """A column of a :class:`Table`.
 
     Attributes
     ----------

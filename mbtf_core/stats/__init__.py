@@ -4,12 +4,15 @@ Needs numpy and scipy alone. ``docs/explanation/statistics.md`` explains when to
 """
 
 from mbtf_core.stats.estimate import (
+    SIGNIFICANT,
     Estimate,
     Outcome,
     by_group,
     elevation_groups,
+    is_significant,
     level_groups,
     mean_estimate,
+    ratio_of,
     t_test,
 )
 from mbtf_core.stats.paired import (
@@ -26,10 +29,12 @@ from mbtf_core.stats.paired import (
 )
 
 __all__ = [
+    "SIGNIFICANT",
     "Estimate",
     "Outcome",
     "by_group",
     "elevation_groups",
+    "is_significant",
     "level_groups",
     "local_error",
     "mean_estimate",
@@ -40,6 +45,7 @@ __all__ = [
     "pooled_relative_error",
     "pooled_variance",
     "psnr",
+    "ratio_of",
     "signal_variance",
     "t_test",
     "unexplained_variance",

@@ -16,6 +16,8 @@ from mbtf_core.directions import ELEVATION_BANDS
 from mbtf_core.errors import InputError
 
 Alternative = Literal["two-sided", "greater", "less"]
+# A value is significant if it differs from zero by more than so many standard errors.
+SIGNIFICANT = 2.0
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,20 @@ class Estimate:
         places = max(0, -first + (1 if error / 10.0**first < 1.95 else 0))
         text = f"{value:.{places}f} ± {error:.{places}f}"
         return f"({text})e{scale:+03d}" if scale else text
+
+
+def is_significant(e: Estimate) -> bool:
+    """Whether a value differs from zero by more than two standard errors; values not finite count as such."""
+    return not math.isfinite(e.value) or abs(e.value) > SIGNIFICANT * e.error
+
+
+def ratio_of(upper: Estimate, lower: Estimate) -> Estimate:
+    """Ratio of two independent estimates; undefined unless the lower one is significantly positive."""
+    n = min(upper.n, lower.n)
+    if lower.value <= 0 or not is_significant(lower):
+        return Estimate(math.nan, math.inf, n)
+    value = upper.value / lower.value
+    return Estimate(value, math.hypot(upper.error, value * lower.error) / lower.value, n)
 
 
 def _exponent(x: float) -> int:

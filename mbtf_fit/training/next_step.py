@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.stats import SIGNIFICANT
 from mbtf_fit.formatting import headline, unreliable
 from mbtf_fit.training.endings import reached
 from mbtf_fit.training.fit_folder import training_digest
@@ -23,8 +24,6 @@ _UNTRAINED, _HARDLY = 100, 0.5
 _PAYS = 0.9
 # Relative standard error of the test error from which more test queries come first.
 _UNCERTAIN = 0.25
-# Standard errors of a significant difference.
-_SIGNIFICANT = 2.0
 # Of an error that is all due to noise, twice the queries remove this share.
 _LIMITED = 0.3
 _NO_GAIN = "neither twice the training nor twice the queries would reduce the error by 5%"
@@ -68,7 +67,7 @@ def next_step(cost: MarginalCost, errors: Mapping[str, Any]) -> NextStep:
     elif data < FLAT:
         short = "the fit overfits noise"
     elif None not in (value, error, own, spread):
-        is_less = value - own > max(0.5 * value, _SIGNIFICANT * math.hypot(error, spread))
+        is_less = value - own > max(0.5 * value, SIGNIFICANT * math.hypot(error, spread))
         short = "the error of training queries is less than half as large" if is_less else ""
     if (
         value is None

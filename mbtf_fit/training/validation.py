@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mbtf_core.data.dataset import Dataset
-from mbtf_core.stats import unexplained_variance
+from mbtf_core.stats import SIGNIFICANT, unexplained_variance
 from mbtf_fit.data.loader import Partition, load_split
 from mbtf_fit.data.queries import ShardQueries
 from mbtf_fit.formatting import above_one
@@ -87,8 +87,6 @@ def history_record(
 
 # Fractions of the budget between which a record counts as the middle of training.
 _MIDDLE = (0.35, 0.65)
-# Standard errors that make a difference significant.
-_SIGNIFICANT = 2.0
 # Fits of the default model: the error after N steps is about proportional to 1 + 50 / N. From 100 steps on,
 # twice the steps follow this law within 0.1 of the logarithm. ``benchmarks/advice.py`` measures both rules.
 _EARLY_STEPS, _LAW_SCATTER = 50.0, 0.1
@@ -238,9 +236,9 @@ def _noise_share(errors: dict[str, Any], noise: float | None) -> float | None:
     others = [mse[name] for name in ("test", "held_out_queries") if name in mse]
     new = min(others, key=lambda e: e["error"], default=None)
     training = mse.get("training")
-    if noise is None or training is None or new is None or new["value"] <= _SIGNIFICANT * new["error"]:
+    if noise is None or training is None or new is None or new["value"] <= SIGNIFICANT * new["error"]:
         return None
     overfit = min(0.5 * (new["value"] - training["value"]), noise)
-    if overfit <= _SIGNIFICANT * 0.5 * math.hypot(new["error"], training["error"]):
+    if overfit <= SIGNIFICANT * 0.5 * math.hypot(new["error"], training["error"]):
         return None
     return min(1.0, float(overfit / new["value"]))

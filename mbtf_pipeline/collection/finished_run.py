@@ -15,7 +15,7 @@ from mbtf_pipeline.compare.compare import COMPARISON_NAME
 from mbtf_pipeline.compare.image_files import with_ending
 from mbtf_pipeline.report.images import file_uri
 from mbtf_pipeline.stages import COMPARE, SHARDS
-from mbtf_pipeline.tables import Column, Thumbnail, estimate, is_significant
+from mbtf_pipeline.tables import Column, Thumbnail, estimate
 
 
 @dataclass(frozen=True)
@@ -97,12 +97,3 @@ def mean_of(estimates: Sequence[Estimate]) -> Estimate:
     n = len(estimates)
     error = math.sqrt(sum(e.error**2 for e in estimates)) / n
     return Estimate(sum(e.value for e in estimates) / n, error, sum(e.n for e in estimates))
-
-
-def ratio_of(upper: Estimate, lower: Estimate) -> Estimate:
-    """Ratio of two independent estimates; undefined unless the lower one is significantly positive."""
-    n = min(upper.n, lower.n)
-    if lower.value <= 0 or not is_significant(lower):
-        return Estimate(math.nan, math.inf, n)
-    value = upper.value / lower.value
-    return Estimate(value, math.hypot(upper.error, value * lower.error) / lower.value, n)

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from functools import partial
 from itertools import combinations
 
-from mbtf_core.stats import Estimate, psnr
-from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun, each_fit, mean_of, ratio_of
+from mbtf_core.stats import Estimate, psnr, ratio_of
+from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun, each_fit, mean_of
 from mbtf_pipeline.collection.recipes import Published, first_known
 from mbtf_pipeline.compare.perceptual_metrics import PERCEPTUAL_METRICS, PerceptualMetric
 from mbtf_pipeline.report.plots import points

@@ -15,8 +15,8 @@ from typing import Any
 
 from mbtf_core.errors import MbtfError
 from mbtf_core.files.atomic import data_sha256, read_json
-from mbtf_core.stats import Estimate, t_test
-from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun, ratio_of
+from mbtf_core.stats import Estimate, ratio_of, t_test
+from mbtf_pipeline.collection.finished_run import MATERIAL, METHOD, FinishedRun
 from mbtf_pipeline.collection.recipes import Published, first_known, seedless
 from mbtf_pipeline.stages import SHARDS
 from mbtf_pipeline.tables import Cell, Column, Table, estimate, rows_of

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from mbtf_core.files.editable import write_document
+from mbtf_core.stats import is_significant
 from mbtf_core.units import clock
 from mbtf_pipeline.cost.measurement import Measurement, pareto_front
 from mbtf_pipeline.cost.study import Study
 from mbtf_pipeline.report.plots import Series, plot
 from mbtf_pipeline.report.report import render
-from mbtf_pipeline.tables import Column, Table, is_significant, rows_of
+from mbtf_pipeline.tables import Column, Table, rows_of
 
 CSV_NAME, PAGE_NAME = "cost.csv", "cost.html"
 _NOISE_AXIS = "RMS error relative to the mean value"

@@ -13,7 +13,7 @@ import numpy as np
 from mbtf_core.color import linear_to_srgb
 from mbtf_core.errors import MbtfError
 from mbtf_core.images.resample import shrink
-from mbtf_core.stats import Estimate
+from mbtf_core.stats import Estimate, is_significant
 from mbtf_fit.formatting import SPLIT_NAMES
 from mbtf_gen.config.generator import GeneratorConfig
 from mbtf_gen.tile.inspection import brief_warnings, inspection_text
@@ -21,7 +21,7 @@ from mbtf_gen.tile.loading import latest_material
 from mbtf_pipeline.report.images import U8, Pixels, data_uri
 from mbtf_pipeline.report.plots import Series, plot, points
 from mbtf_pipeline.stages import FITS, read_stamp
-from mbtf_pipeline.tables import NOT_SIGNIFICANT, data_errors, estimate, is_significant
+from mbtf_pipeline.tables import NOT_SIGNIFICANT, data_errors, estimate
 
 UNEXPLAINED = "unexplained variance"
 # Ways to group queries: key in the record, title, axis of the plot, and head of the table.

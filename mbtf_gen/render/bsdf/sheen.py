@@ -40,7 +40,7 @@ def fiber_density(sine2: Float, roughness: Float) -> Float:
 
 
 def sheen_value(wi: Vector3f, wo: Vector3f, roughness: Float, q_i: Float, q_o: Float) -> Float:
-    """f·μo at F = 1."""
+    """Sheen lobe times the cosine of the other direction, f·μo, at F = 1."""
     h = wi + wo
     sine2 = (dr.square(h.x) + dr.square(h.y)) / dr.squared_norm(h)
     below = dr.fma(q_i, wo.z, q_o * wi.z) - wi.z * wo.z

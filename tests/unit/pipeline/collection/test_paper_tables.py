@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 from support.paths import ROOT
 
-from mbtf_core.stats import Estimate
-from mbtf_pipeline.collection.finished_run import FinishedRun, mean_of, ratio_of
+from mbtf_core.stats import Estimate, ratio_of
+from mbtf_pipeline.collection.finished_run import FinishedRun, mean_of
 from mbtf_pipeline.collection.paper_tables import ablations, methods
 from mbtf_pipeline.collection.recipes import PaperRecipe, first_known, load
 from mbtf_pipeline.tables import Table
