@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mbtf_core.app.console import CONSOLE, Console
 from mbtf_core.app.options import Verbose
-from mbtf_fit.formatting import report_errors
+from mbtf_fit.cli.results import report_errors
 
 
 def evaluate(

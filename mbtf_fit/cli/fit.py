@@ -26,8 +26,8 @@ from mbtf_core.app.options import (
 from mbtf_core.app.progress import Progress
 from mbtf_core.errors import InputError, PartialError, UsageError
 from mbtf_core.run.signals import keep_on_interruption
+from mbtf_fit.cli.results import describe_fit, fits_table
 from mbtf_fit.config import DEFAULT_MODEL, FitConfig, ModelName, best_model
-from mbtf_fit.formatting import describe_fit, fits_table
 
 if TYPE_CHECKING:
     from mbtf_core.data.folder import DataFolder

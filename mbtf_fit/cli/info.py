@@ -11,7 +11,7 @@ from mbtf_core.app.options import Switch, Verbose
 from mbtf_core.errors import InputError
 from mbtf_core.paths import suggest_path
 from mbtf_core.units import clock
-from mbtf_fit.formatting import report_errors
+from mbtf_fit.cli.results import report_errors
 
 if TYPE_CHECKING:
     from mbtf_core.data.folder import DataFolder
@@ -125,7 +125,7 @@ def models(*, operations: Switch = False, console: Console = CONSOLE) -> None:
     operations
         List instead the operations that a model is made of.
     """
-    from mbtf_fit.formatting import format_table
+    from mbtf_fit.cli.results import format_table
     from mbtf_fit.models.registry import MODELS, UNUSABLE
     from mbtf_fit.ops import Operation
 

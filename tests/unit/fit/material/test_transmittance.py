@@ -15,11 +15,11 @@ from mbtf_core.data.lattice import Lattice
 from mbtf_core.data.shard_files import read_shard, write_shard
 from mbtf_core.errors import InputError
 from mbtf_core.files.atomic import file_sha256
+from mbtf_fit.cli.results import report_errors
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training
 from mbtf_fit.data.streaming import Selection
 from mbtf_fit.evaluation import evaluate
-from mbtf_fit.formatting import report_errors
 from mbtf_fit.material.format import read_description
 from mbtf_fit.material.transmittance import (
     TRANSMITTANCE_NAME,

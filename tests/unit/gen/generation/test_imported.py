@@ -19,9 +19,9 @@ from mbtf_core.data.dataset import Dataset
 from mbtf_core.data.verify import verify
 from mbtf_core.errors import InputError
 from mbtf_fit import fit
+from mbtf_fit.cli.results import report_errors
 from mbtf_fit.config import FitConfig
 from mbtf_fit.data.loader import load_training
-from mbtf_fit.formatting import report_errors
 from mbtf_gen.config.exchange import ImportConfig
 from mbtf_gen.generation import imported
 from mbtf_gen.generation.imported import Import, import_measured
