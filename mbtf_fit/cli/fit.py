@@ -188,8 +188,8 @@ def _fit_bytes(config: FitConfig, lattice: Lattice) -> int:
 def resolve_config(
     options: Options[FitConfig], quality: Quality | None, *shards: Path | DataFolder
 ) -> FitConfig:
-    """Configuration of a fit, or of one of several data sets. Without a model among the options, the network
-    to keep decides, or the data sets."""
+    """Configuration that a command line asks for, of a fit or of one of several data sets. Without a model
+    among the options, the network to keep decides, or the data sets."""
     from mbtf_fit.config import fitter_options
 
     overrides = options.explicit()

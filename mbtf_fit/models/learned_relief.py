@@ -97,8 +97,6 @@ class LearnedRelief(Relief):
         before a step of training, after a fraction of its budget."""
         import torch
 
-        from mbtf_fit.pytorch.operations import learned_heights
-
         heights = self.material.texture("heights")
         interval = FILTERED * max(1, heights.packing.texels // FILTERED_TEXELS)
         part = int(FILTERED_LEAST * fraction)
@@ -110,7 +108,7 @@ class LearnedRelief(Relief):
             if not (filtered or step % TRACED == 0):
                 return
             x = heights.blurred(sigma).view(self.material.lattice.shape())
-            self._see(learned_heights(x).cpu(), filtered=filtered)
+            self._see((HEIGHT_SCALE * x - FIRST_DEPTH).clamp_max(0.0).cpu(), filtered=filtered)
 
     def _see(self, heights: Tensor, *, filtered: bool) -> None:
         from mbtf_core.data.geometry import Geometry

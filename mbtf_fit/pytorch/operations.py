@@ -15,7 +15,7 @@ from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_fit import ops
-from mbtf_fit.ops.constants import FIRST_DEPTH, HEIGHT_SCALE, LEAST_FACING
+from mbtf_fit.ops.constants import HEIGHT_SCALE, LEAST_FACING
 from mbtf_fit.pytorch.textures import FeatureTextures
 from mbtf_fit.surface.facets import fresnel
 from mbtf_fit.surface.known import KnownSurface
@@ -138,11 +138,6 @@ def _rise(learned: str, run: Execution, u: Tensor, z: Tensor, omega_o: Tensor) -
     # (H1) dz = dh / (1 - ∇h · ω_o,xy / ω_o,z), the denominator bounded from below
     facing = 1.0 - HEIGHT_SCALE * (gradient / aspect * slope).sum(1, keepdim=True)
     return HEIGHT_SCALE * (x - x.detach()) / facing.clamp_min(LEAST_FACING)
-
-
-def learned_heights(x: Tensor) -> Tensor:
-    """Heights in tile widths of a learned texture's numbers."""
-    return (HEIGHT_SCALE * x - FIRST_DEPTH).clamp_max(0.0)
 
 
 @PYTORCH.implements(ops.Shade)

@@ -38,7 +38,7 @@ SMALLER = "reduce --queries or --resolution, or choose another folder with -o"
 
 
 def resolve_config(options: Options[G], material: str | None, presets: Mapping[str, Any] | None = None) -> G:
-    """Configuration of a command for a material.
+    """Configuration that a command line asks for.
 
     Raises
     ------
