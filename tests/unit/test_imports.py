@@ -6,11 +6,13 @@ import ast
 import re
 import sys
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
+from graphlib import TopologicalSorter
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
+import pytest
 from conftest import RunPython
 from support.paths import ROOT
 
@@ -116,6 +118,34 @@ def faults(names: Iterable[str], module: str) -> list[str]:
 def test_imports_run_downwards() -> None:
     found = [fault for name in SOURCES for fault in faults(imports_of(name), name)]
     assert found == []
+
+
+def graph_of(name_of: Callable[[str], str]) -> dict[str, set[str]]:
+    """Who imports whom, of all sources by the names that `name_of` gives them."""
+    graph: dict[str, set[str]] = {}
+    for module in SOURCES:
+        names = {name_of(name) for name in imports_of(module) if name in SOURCES}
+        graph.setdefault(name_of(module), set()).update(names - {name_of(module)})
+    return graph
+
+
+@pytest.mark.parametrize("name_of", [lambda module: module, room], ids=["modules", "rooms"])
+def test_no_circle(name_of: Callable[[str], str]) -> None:
+    TopologicalSorter(graph_of(name_of)).prepare()
+
+
+def public_classes() -> dict[str, list[str]]:
+    """Modules that define a public class, by its name."""
+    found: dict[str, list[str]] = {}
+    for module, path in SOURCES.items():
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                found.setdefault(node.name, []).append(module)
+    return found
+
+
+def test_no_two_public_classes_share_a_name() -> None:
+    assert {name: where for name, where in public_classes().items() if len(where) > 1} == {}
 
 
 def test_commands_set_llvm_before_dr_jit_is_imported(run_python: RunPython) -> None:
