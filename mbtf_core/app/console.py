@@ -231,6 +231,13 @@ def _with_negative_values(tokens: Sequence[str]) -> list[str]:
     return joined
 
 
+def format_table(rows: list[list[str]]) -> str:
+    """Rows of cells as lines of columns."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)) for row in rows)
+    return "\n".join(line.rstrip() for line in lines)
+
+
 def run(app: App, argv: Sequence[str] | None = None) -> int:
     """Run a command line and return its exit code; no exception leaves except SystemExit.
 

@@ -125,7 +125,7 @@ def models(*, operations: Switch = False, console: Console = CONSOLE) -> None:
     operations
         List instead the operations that a model is made of.
     """
-    from mbtf_fit.cli.results import format_table
+    from mbtf_core.app.console import format_table
     from mbtf_fit.models.registry import MODELS, UNUSABLE
     from mbtf_fit.ops import Operation
 

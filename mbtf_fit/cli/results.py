@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from mbtf_core.app.console import format_table
 from mbtf_core.stats import SIGNIFICANT
 from mbtf_core.units import clock
 from mbtf_fit.formatting import (
@@ -129,10 +130,3 @@ def _table_of(errors: Mapping[str, Any]) -> list[str]:
     rows.append(["queries", *(str(split["n"]) for split in splits)])
     names = ["unexplained variance", *(SPLIT_NAMES.get(name, name) for name in errors)]
     return [*format_table([names, *rows]).splitlines(), *why]
-
-
-def format_table(rows: list[list[str]]) -> str:
-    """Rows of cells as lines of columns."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)) for row in rows)
-    return "\n".join(line.rstrip() for line in lines)

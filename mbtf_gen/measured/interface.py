@@ -89,7 +89,7 @@ def from_plane(xy: NDArray[np.floating[Any]]) -> F32:
 
 
 def check_texels(rows: int, columns: int, path: Path) -> None:
-    """Refuse images without texels, and images that are too large."""
+    """Refuse measured BTFs without texels, and those that are too large."""
     if min(rows, columns) < 1 or max(rows, columns) > MOST_ACROSS or rows * columns > MOST_TEXELS:
         raise InputError(
             f"claims images of {columns} x {rows} texels; 1 to {MOST_ACROSS:,} across are read, "
