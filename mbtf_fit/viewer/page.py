@@ -194,7 +194,8 @@ def content_of(material: Material, name: str, packed: dict[str, PackedTexture]) 
             "levels": f"0 to {material.lattice.finest}",
             "network weights": sum(p.numel() for p in material.model.parameter_groups()[1]),
             "texture values": sum(p.numel() for p in material.model.parameter_groups()[0]),
-            "training steps": training.get("steps"),
+            # Of the state that is kept.
+            "training steps": training.get("kept_step") or training.get("steps"),
             "training time in s": training.get("seconds"),
         },
     }

@@ -58,4 +58,7 @@ byId("canvas").addEventListener("webglcontextlost", () =>
   fail(new Error("The graphics card was reset. Load the page again.")),
 );
 window.addEventListener("error", (event) => fail(event.error ?? new Error(event.message)));
-show(CONTENT).catch(fail);
+show(CONTENT).catch((error) => {
+  fail(error);
+  byId("panel").hidden = true;
+});
