@@ -2,9 +2,10 @@
 
     python benchmarks/advice.py --out FOLDER [MATERIAL ...] [--seeds 2]
 
-Eight materials, in the preset ``draft`` at 64 texels, are fitted with 50, 100, 200, ... 1600 steps; with
-other seeds than 0, up to 800. Glossy bricks of little relief have half of the queries: fits overfit. What a
-fit expects is followed, on test queries of 256 paths, three quarters of them drawn by the highlights:
+Eight materials, 64 texels across with 400 queries of 4 paths per texel, are fitted with 50, 100, 200, ...
+1600 steps; with other seeds than 0, up to 800. Glossy bricks of little relief have half of the queries: fits
+overfit. What a fit expects is followed, on test queries of 256 paths, three quarters of them drawn by the
+highlights:
 
 - ``few`` and ``more``, about 0.8 of this error after twice the time: right if twice the steps leave this
   factor, within 1.5;
@@ -32,7 +33,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from common import ASSETS, finish, is_available, kept, parser_of, start
-from front import HIGHLIGHTS, TEST_SPP
+from front import QUERIES
 from quality import generator_config
 
 from mbtf_fit import FitConfig, fit
@@ -50,7 +51,7 @@ GOLD = "height: {height}\nbase_color: [1.0, 0.77, 0.34]\nmetallic: 1\nroughness:
 STEPS = tuple(50 * 2**k for k in range(6))
 # After so many steps, the number of queries is doubled; so many steps have seeds other than 0.
 QUERIES_AT, OTHERS_TO = 800, 800
-QUERIES = 400
+PER_TEXEL = 400
 # Stone bricks of this relief, with half of the queries.
 FEW, FEW_RELIEF, FEW_QUERIES = "few", 0.01, 200
 RESOLUTION = 64
@@ -86,8 +87,8 @@ def data_config(name: str, folder: Path, twice: bool) -> GeneratorConfig:
     if name == FEW:
         geometry = config.geometry.model_copy(update={"height_scale": FEW_RELIEF})
         config = config.model_copy(update={"geometry": geometry})
-    train = (FEW_QUERIES if name == FEW else QUERIES) * (2 if twice else 1)
-    own = {"train": f"{train}/texel", "test_spp": TEST_SPP, "test_highlights": HIGHLIGHTS}
+    train = (FEW_QUERIES if name == FEW else PER_TEXEL) * (2 if twice else 1)
+    own = {**QUERIES, "train": f"{train}/texel"}
     queries = config.queries.model_copy(update=own)
     return config.model_copy(update={"queries": queries})
 

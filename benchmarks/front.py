@@ -4,8 +4,8 @@
     python benchmarks/front.py --out FOLDER --ablation relief|neumip+ [MATERIAL] [--time 30s]
     python benchmarks/front.py --out FOLDER --rock-cliff [--time 100s]
 
-For each material, all models are trained on the same data: those of the preset ``draft`` at 128 texels
-across, of five assets and six texture sets. Test queries have 256 paths, and three quarters of them are drawn
+For each material, all models are trained on the same data, 128 texels across, 400 queries of 4 paths per
+texel, of five assets and six texture sets. Test queries have 256 paths, and three quarters of them are drawn
 by the highlights. All networks have the same width; ``relief`` traces one, two or four view rays per
 footprint; on cloth, measured where it is named, ``cloth`` takes its place. On the materials of Kuznetsov et
 al. 2021, ``neumip-baseline`` is trained as well. ``--ablation`` leaves out one part of a model at a time, on
@@ -50,8 +50,8 @@ from mbtf_pipeline.collection.recipes import PaperRecipe, first_known
 from mbtf_pipeline.recipe import load_recipe
 
 RESOLUTION = 128
-# Paths per test query, and the share of these that highlights draw.
-TEST_SPP, HIGHLIGHTS = 256, 0.75
+# Training queries; test queries, and the share of these that highlights draw.
+QUERIES = {"train": "400/texel", "spp": 4, "test_spp": 256, "test_highlights": 0.75}
 # Training time in which a rate is measured, and how often. The first steps of ``neumip+``, which trace its
 # heights, take seconds.
 RATE_TIME, RATE_TURNS = "20s", 3
@@ -118,8 +118,7 @@ OVER_NEUMIP = 1.2
 def shards(name: str, folder: Path) -> Path:
     """Data of a material, generated where they are missing."""
     out = folder / name / "shards"
-    test = {"test_spp": TEST_SPP, "test_highlights": HIGHLIGHTS}
-    generate(generator_config(name, "draft", RESOLUTION, **test), out)
+    generate(generator_config(name, "draft", RESOLUTION, **QUERIES), out)
     return out
 
 

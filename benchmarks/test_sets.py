@@ -31,7 +31,8 @@ from mbtf_fit.data.loader import load_split
 from mbtf_gen.generation.run import generate
 from mbtf_gen.planning.highlights import PILOT_MOST, PILOT_SHARE, PILOT_SPP
 
-RESOLUTION, TRAIN = 64, "400/texel"
+RESOLUTION = 64
+TRAIN = {"train": "400/texel", "spp": 4, "test": "1024"}
 STANDARD_ERRORS, RESOLVED = 4.0, 0.25
 THRESHOLDS = {"relative_error": 0.05, "standard_errors": STANDARD_ERRORS}
 
@@ -55,7 +56,7 @@ def trained(name: str, folder: Path, steps: int) -> None:
     """Fit a material, unless it is fitted."""
     if (folder / "fit" / "material.json").exists():
         return
-    generate(generator_config(name, "draft", RESOLUTION, train=TRAIN, test="1024"), folder / "train")
+    generate(generator_config(name, "draft", RESOLUTION, **TRAIN), folder / "train")
     model = CLOTH_MODELS["relief"] if name in CLOTHS else RELIEF
     settings = deep_merge(model, {"training": {"steps": steps}})
     fit(FitConfig.model_validate(settings), folder / "train", folder / "fit", overwrite=True)

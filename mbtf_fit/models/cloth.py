@@ -1,8 +1,9 @@
 """Cloth: a neural material that traces the envelope of fibers and knows their directions.
 
-:mod:`Relief <mbtf_fit.models.relief>` on the heights that fibers show from above, whose decoder also sees
-light and view about the fibers' axis (:mod:`mbtf_fit.ops.fibers`): fibers scatter light along cones about
-their axis (Marschner et al., SIGGRAPH 2003), which neither the normal nor the half vector of a surface tells.
+:mod:`Relief <mbtf_fit.models.relief>` on the heights that fibers show from above, whose decoder also sees the
+height of the intersection, as little light comes between yarns, and light and view about the fibers' axis
+(:mod:`mbtf_fit.ops.fibers`): fibers scatter light along cones about their axis (Marschner et al., SIGGRAPH
+2003), which neither the normal nor the half vector of a surface tells.
 """
 
 from __future__ import annotations
@@ -11,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 from mbtf_fit.models.relief import Relief
-from mbtf_fit.ops import FiberFrame, Operation
-from mbtf_fit.ops.constants import FIBERS, PLACES
+from mbtf_fit.ops import FiberFrame, Operation, Transform
+from mbtf_fit.ops.constants import DEPTH_SCALE, FIBERS, PLACES
 from mbtf_fit.sections import NetworkSection
 
 
@@ -42,4 +43,5 @@ class Cloth(Relief):
         operations, names = super().surface_inputs(network)
         _, finer = PLACES[network.relief.places]
         fibers = FiberFrame("fibers", "hits", "level", "omega_i", "omega_o", FIBERS, finer)
-        return [*operations, fibers], [*names, "fibers"]
+        depth = Transform("depth", "z", scale=DEPTH_SCALE)
+        return [*operations, depth, fibers], [*names, "depth", "fibers"]

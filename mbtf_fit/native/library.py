@@ -46,7 +46,7 @@ class ModelStruct(ctypes.Structure):
         *((name, TexturesStruct) for name in ("pyramid", "offset_texture")),
         *((name, NetworkStruct) for name in ("decoder", "offset")),
         *((name, _F32) for name in ("unit", "most", "offset_scale", "grazing", "aspect")),
-        *((name, _F32) for name in ("irradiance_scale", "height_scale", "least_facing")),
+        *((name, _F32) for name in ("irradiance_scale", "depth_scale", "height_scale", "least_facing")),
         *((name, _I32) for name in ("coordinates", "half_vector", "hints", "frame", "fibers", "gate")),
         ("depth_weights", _POINTER),
     )

@@ -21,8 +21,8 @@ HINTS = 7
 # of the coverage, of cosines about the axis, of the variance of the lobe in rad².
 FIBER_HINTS, FIBER_CHANNELS = 6, 7
 LEAST_TANGENTS, LEAST_FIBER_COSINE, LEAST_FIBER_VARIANCE = 0.05, 0.02, 0.005
-# Factor of the irradiance under the logarithm.
-IRRADIANCE_SCALE = 4.0
+# Factor of the irradiance under the logarithm, and of heights in tile widths.
+IRRADIANCE_SCALE, DEPTH_SCALE = 4.0, 10.0
 # Channels of the maps: center of the slopes (x, y), moments about 0 (xx, xy, yy), base color (RGB); of glossy
 # surfaces besides α² and metallic; of coated ones besides weight and α² of the clear coat.
 DIFFUSE_CHANNELS, GLOSSY_CHANNELS, COATED_CHANNELS = MAP_CHANNELS = 8, 10, 12

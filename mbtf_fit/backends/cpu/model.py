@@ -93,7 +93,7 @@ class NativeModel:
         self.description = d = ModelStruct()
         d.aspect = material.lattice.aspect
         d.coordinates, d.half_vector = pattern.coordinates, pattern.half_vector
-        d.irradiance_scale = pattern.irradiance_scale
+        d.irradiance_scale, d.depth_scale = pattern.irradiance_scale, pattern.depth_scale
         d.hints, d.frame, d.fibers, d.gate = pattern.hints, pattern.frame, pattern.fibers, pattern.gate
         if pattern.offset is not None:
             d.offset_scale, d.grazing = pattern.offset.scale, pattern.offset.grazing

@@ -36,7 +36,8 @@ class Pattern:
     displace : displacement by traced heights, or None
     coordinates : of light and of view that the decoder reads
     half_vector, hints, frame, fibers : whether it reads those
-    irradiance_scale : factor of the irradiance under the logarithm
+    irradiance_scale, depth_scale : factors of the irradiance under the logarithm, and of the height that is
+        read with the fibers
     unit, most : tensors of the unit and of the bound
     gate : whether the value has a gated core
     factors : names of calibration factors that the value is multiplied by
@@ -53,6 +54,7 @@ class Pattern:
     frame: bool
     fibers: bool
     irradiance_scale: float
+    depth_scale: float
     unit: str
     most: str
     gate: bool
@@ -116,11 +118,14 @@ class _Matcher:
         displace, offset, network = self._moved(lookup.u)
         fibers = bool(rest) and self._is(rest[-1], ops.FiberFrame)
         about = rest.pop() if fibers else ""
-        hints, scale, frame = False, 1.0, len(rest) in (2, 5)
+        depth = rest.pop() if fibers and rest else ""
+        hints, scale, frame, depth_scale = False, 1.0, len(rest) in (2, 5), 0.0
         if displace is not None:
             shade, hits = self._surface(displace)
             if fibers:
                 self._take(about, ops.FiberFrame, hits=hits, **_READ)
+                identity = {"function": "identity", "divisor": None, "factor": None}
+                depth_scale = self._take(depth, ops.Transform, x=displace.z, **identity).scale
             if len(rest) >= 3:
                 hints, scale = True, self._hints(rest, shade, unit)
                 del rest[:3]
@@ -134,7 +139,7 @@ class _Matcher:
         self._expect(not rest, not self._unused)
         return Pattern(
             *(lookup, decoder, offset, network, displace, _LIGHTS[light, view], half, hints, frame, fibers),
-            *(scale, unit, most, gate is not None, tuple(factors)),
+            *(scale, depth_scale, unit, most, gate is not None, tuple(factors)),
         )
 
     def _moved(self, name: str) -> tuple[ops.Displace | None, ops.Offset | None, ops.Network | None]:

@@ -41,14 +41,15 @@ typedef struct {
 } mbtf_textures;
 
 /* Operations that mbtf_fit/backends/cpu/pattern.py matches: a neural offset unless offset.layers is 0, or traced heights
- * where depth_weights (a number per level) are given. Where height_scale is not 0, the offset texture holds learned heights over height_scale, in one
- * channel. The decoder sees so many coordinates of light and of view: 2 (x, y) or 3; then, where they are not 0,
- * half vector and difference vector, hints, light and view about the known normal, directions about fibers. With
- * `gate`, its last output is that of the gate. */
+ * where depth_weights (a number per level) are given. Where height_scale is not 0, the offset texture holds
+ * learned heights over height_scale, in one channel. The decoder sees so many coordinates of light and of view:
+ * 2 (x, y) or 3; then, where they are not 0, half vector and difference vector, hints, light and view about the
+ * known normal, the height times depth_scale and directions about fibers. With `gate`, its last output is that
+ * of the gate. */
 typedef struct {
     mbtf_textures pyramid, offset_texture;
     mbtf_network decoder, offset;
-    float unit, most, offset_scale, grazing, aspect, irradiance_scale, height_scale, least_facing;
+    float unit, most, offset_scale, grazing, aspect, irradiance_scale, depth_scale, height_scale, least_facing;
     int32_t coordinates, half_vector, hints, frame, fibers, gate;
     const float *depth_weights;
 } mbtf_model;
