@@ -79,6 +79,8 @@ PARTS: dict[str, dict[str, dict[str, Any]]] = {
         "relief": {},
         "two rays": {"relief": {"places": 2}},
         "four rays": {"relief": {"places": 4}},
+        "eight rays": {"relief": {"places": 8}},
+        "sixteen rays": {"relief": {"places": 16}},
         "no gate": {"relief": {"gate": False}},
         "no oversampling": {"oversampling": 1},
         **COMMON,

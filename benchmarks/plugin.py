@@ -135,7 +135,7 @@ def compare_formats(material: Any, shards: Path, plugin: Any, runs: int) -> dict
 def main() -> int:
     parser = parser_of(__doc__)
     parser.add_argument("--model", choices=("neumip", "relief"), default="neumip")
-    parser.add_argument("--places", type=int, choices=(1, 2, 4), default=1)
+    parser.add_argument("--places", type=int, choices=(1, 2, 4, 8, 16), default=1)
     parser.add_argument("--material", type=Path)
     parser.add_argument("--shards", type=Path)
     parser.add_argument("--runs", type=int, default=7)

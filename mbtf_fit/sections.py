@@ -46,7 +46,7 @@ class ReliefSection(Settings):
     """What the model `relief` takes from the data set's geometry, and `neumip+` from the heights that it
     learns; every part can be left out."""
 
-    places: Literal[1, 2, 4] = Field(
+    places: Literal[1, 2, 4, 8, 16] = Field(
         1, description="view rays that are traced per query, spread over its footprint"
     )
     hints: bool = Field(

@@ -140,7 +140,7 @@ class Relief(Model):
 
 
 def known_surface(places: int) -> tuple[Trace, Shade]:
-    """The operations that trace and shade the surface of a material, for 1, 2 or 4 places of a footprint."""
+    """The operations that trace and shade the surface of a material, for so many places of a footprint."""
     offsets, finer = PLACES[places]
     trace = Trace("z", "hits", "u", "level", "omega_o", HEIGHTS, offsets)
     tensors = MAPS, HORIZONS, LIGHT_WIDTH, DIELECTRIC

@@ -15,7 +15,7 @@ ENVIRONMENT = "MBTF_KERNEL"
 # Name of the library in this folder, without suffix.
 LIBRARY = "_kernel"
 # Largest sizes that the kernel takes; as in src/kernel.h.
-MAX_CHANNELS, MAX_WIDTH, MAX_LAYERS, MAX_LEVELS, MAX_PLACES = 64, 128, 16, 16, 4
+MAX_CHANNELS, MAX_WIDTH, MAX_LAYERS, MAX_LEVELS, MAX_PLACES = 64, 128, 16, 16, 16
 
 _I32, _I64, _F32, _POINTER = ctypes.c_int32, ctypes.c_int64, ctypes.c_float, ctypes.c_void_p
 # Version of what the functions mean, where sizes of structures do not show it; as in src/kernel.h.

@@ -16,7 +16,7 @@
 #define MAX_WIDTH 128
 #define MAX_LAYERS 16
 #define MAX_LEVELS 16
-#define MAX_PLACES 4
+#define MAX_PLACES 16
 #define HINTS 7
 /* Directions about fibers, which follow the hints of surfaces that have some. */
 #define FIBER_HINTS 6

@@ -51,7 +51,7 @@ def surface(**options: Any) -> KnownSurface:
     return KnownSurface.of(geometry(LATTICE, np.zeros((8, 8), np.float32), **options), LATTICE, 0.0)
 
 
-@pytest.mark.parametrize("places", [1, 2, 4])
+@pytest.mark.parametrize("places", [1, 2, 4, 16])
 def test_a_flat_lambert_tile(places: int) -> None:
     found = hints_of(surface(), *queries(500), places=places)
     wanted = torch.tensor([0.0, 1.0, 0.0, 0.0, *(c / math.pi for c in (0.5, 0.4, 0.3))])
@@ -211,7 +211,7 @@ def test_footprints_beyond_the_levels_are_clamped(size: float, compiled: bool) -
 @needs_kernel
 @pytest.mark.parametrize(("glossy", "coated"), [(True, False), (False, False), (True, True)])
 @pytest.mark.parametrize("aspect", [1.0, 0.5])
-@pytest.mark.parametrize("places", [1, 2, 4])
+@pytest.mark.parametrize("places", [1, 2, 4, 16])
 def test_kernel_and_pytorch_agree(glossy: bool, coated: bool, aspect: float, places: int) -> None:
     lattice = Lattice(3, aspect)
     known = rough_surface(lattice, glossy=glossy, coated=coated)
