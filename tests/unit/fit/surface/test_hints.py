@@ -18,6 +18,7 @@ from torch import Tensor
 from mbtf_core.data.lattice import Lattice, sigma_of_level
 from mbtf_fit.models.relief import known_surface
 from mbtf_fit.native import library
+from mbtf_fit.ops.constants import PLACES
 from mbtf_fit.surface import hints
 from mbtf_fit.surface.hints import compute_hints
 from mbtf_fit.surface.known import KnownSurface, lookup_sigma, prefilter
@@ -206,6 +207,23 @@ def test_footprints_beyond_the_levels_are_clamped(size: float, compiled: bool) -
         for s in (size, 0.5 if size > 0.1 else 0.5 * 2.0**-LATTICE.finest)
     )
     torch.testing.assert_close(found, wanted, atol=0, rtol=0)
+
+
+def test_more_places_come_closer_to_the_mean_over_the_footprint() -> None:
+    """Of 1000 view rays at Gaussian positions, shaded at the finest level."""
+    lattice = Lattice(5)
+    known, level = rough_surface(lattice), torch.full((300,), 3.5)
+    u, _, light, view = queries(300, lattice)
+    trace, shade = known_surface(16)
+    everywhere = replace(trace, places=tuple(map(tuple, np.random.default_rng(0).normal(size=(1000, 2)))))
+    _, hits = known.intersections(everywhere, u, level, view)
+    wanted = known.shading(replace(shade, finer=5.0), hits, level, light, view)
+    errors = []
+    for places in PLACES:
+        found = hints_of(known, u, 0.5 * torch.exp2(-level), light, view, places=places)[:, 1:]
+        errors.append(float((found - wanted).square().mean().sqrt()))
+    assert errors == sorted(errors, reverse=True)
+    assert errors[-1] < 0.6 * errors[0]
 
 
 @needs_kernel
