@@ -1,7 +1,7 @@
 """Make docs/pictures/weaves.jpg: the named weaves of docs/how-to/make-cloth.md, path-traced and fitted.
 
 Two commands make each fit: ``mbtf-gen material.yaml --quality draft --lights-per-path 4 -o shards`` and
-``mbtf-fit shards --quality draft``.
+``mbtf-fit shards --quality draft --set network.relief.places=16``.
 Finished folders are kept in out/weaves. Prints errors, and contrasts of the fits (luminance Y, R - Y, B - Y)
 over those of the references. From the repository's root, in half an hour: ``.venv/bin/python
 docs/pictures/make_weaves_picture.py``.
@@ -45,6 +45,7 @@ TILES = 3
 # With fewer paths, the noise of the reference looks like fibers.
 PICTURE = f"--view 55,-90 --light 35,140 --tiles-across {TILES} --size 144 --spp 400".split()
 DRAFT = ("--quality", "draft")
+RAYS = ("--set", "network.relief.places=16")
 QUERIES = {"u": 2, "sigma": 1, "omega_i": 3, "omega_o": 3}
 EXPOSURE = 1.65
 ACROSS = 2
@@ -83,7 +84,7 @@ def pair(folder: Path) -> tuple[dict[str, float], Image.Image]:
     """Unexplained variance of the picture; reference and fit side by side."""
     shards, fit, compared = (str(folder / name) for name in ("shards", "fit", "compared"))
     run("mbtf-gen", str(folder / "material.yaml"), *DRAFT, "--lights-per-path", "4", "-o", shards)
-    run("mbtf-fit", shards, *DRAFT, "-o", fit)
+    run("mbtf-fit", shards, *DRAFT, *RAYS, "-o", fit)
     (errors,) = run("mbtf-fit", "compare", fit, shards, *PICTURE, "-o", compared)["pictures"]
     stored = read_exr(folder / "compared" / f"query-tiles{TILES}.exr", (*QUERIES, "value_a", "value_b"))
     u, sigma, *directions = (stored[name].reshape(-1, size) for name, size in QUERIES.items())
