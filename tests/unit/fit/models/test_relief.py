@@ -107,3 +107,16 @@ def test_cloth_without_its_fibers_is_refused() -> None:
     tensors = {k: t for k, t in model_of("cloth").weights().items() if not k.startswith("surface.fibers")}
     with pytest.raises(InputError, match=r"do not fit the model cloth: 'surface\.fibers\.0'"):
         build_model("cloth", LATTICE, **VARIANTS["cloth"]).load_weights(tensors)
+
+
+@pytest.mark.parametrize(("name", "reads"), [("cloth", True), ("default", False)])
+def test_cloth_reads_the_height_of_the_intersection(name: str, reads: bool) -> None:
+    """Besides the displacement of the lookup by it, which is off here."""
+    model = model_of(name)
+    with torch.no_grad():
+        model.number("depth_weights").zero_()
+    batch = traced_batch(model)
+    deeper = batch.hints.clone()
+    deeper[:, 0] -= 0.05
+    arrays = (batch.u, batch.sigma, batch.omega_i, batch.omega_o)
+    assert bool((model(*arrays, batch.hints) != model(*arrays, deeper)).any()) == reads
