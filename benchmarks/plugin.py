@@ -41,6 +41,7 @@ from mbtf_core.data.lattice import Lattice  # noqa: E402
 from mbtf_core.directions import from_angles  # noqa: E402
 from mbtf_core.pictures import Camera  # noqa: E402
 from mbtf_fit.config import ModelName  # noqa: E402
+from mbtf_fit.ops.constants import PLACES  # noqa: E402
 from mbtf_gen.engine.runtime import load_mitsuba  # noqa: E402
 
 # Least ratio of PyTorch's time to the plugin's, most seconds of a first run, most deviation from conformance.
@@ -135,7 +136,7 @@ def compare_formats(material: Any, shards: Path, plugin: Any, runs: int) -> dict
 def main() -> int:
     parser = parser_of(__doc__)
     parser.add_argument("--model", choices=("neumip", "relief"), default="neumip")
-    parser.add_argument("--places", type=int, choices=(1, 2, 4, 8, 16), default=1)
+    parser.add_argument("--places", type=int, choices=PLACES, default=1)
     parser.add_argument("--material", type=Path)
     parser.add_argument("--shards", type=Path)
     parser.add_argument("--runs", type=int, default=7)

@@ -3,7 +3,7 @@
 Two commands make each fit: ``mbtf-gen material.yaml --quality draft --lights-per-path 4 -o shards`` and
 ``mbtf-fit shards --quality draft --set network.relief.places=16``.
 Finished folders are kept in out/weaves. Prints errors, and contrasts of the fits (luminance Y, R - Y, B - Y)
-over those of the references. From the repository's root, in half an hour: ``.venv/bin/python
+over those of the references. From the repository's root, in an hour: ``.venv/bin/python
 docs/pictures/make_weaves_picture.py``.
 """
 

@@ -42,8 +42,8 @@ MAX_CROSSINGS = 64
 # lookups there are finer by. Lookups at one place have the footprint itself. Of offsets from 0.4 to 0.9 σ and
 # levels from 0 to 1.5, these leave the least of test values to the network, by regression of those of six
 # materials on the core. Places of the footprint's variance (√(3/4) σ and 1 level) leave more. Two places are
-# apart across the view alone, which gives most of the gain. Eight and sixteen have quantiles of a Gaussian in
-# place of two values; spirals and other widths leave the same error.
+# apart across the view alone, which gives most of the gain. Eight and sixteen have 0.9 of the quantiles of a
+# Gaussian in place of two values; spirals and other widths leave the same error.
 _APART = 0.8 * math.sqrt(0.75)
 _TWO, _FOUR = (-_APART, _APART), (-1.04, -0.29, 0.29, 1.04)
 

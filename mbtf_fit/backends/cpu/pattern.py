@@ -24,6 +24,9 @@ _LIGHTS = {("omega_i[0:2]", "omega_o[0:2]"): 2, ("omega_i", "omega_o"): 3}
 # What is read of a query about the surface.
 _READ = {"level": "level", "omega_i": "omega_i", "omega_o": "omega_o"}
 
+# Of a transform that the kernel computes from its function and its scale alone.
+_SCALED = {"divisor": None, "factor": None, "most": None}
+
 
 @dataclass(frozen=True)
 class Pattern:
@@ -124,8 +127,8 @@ class _Matcher:
             shade, hits = self._surface(displace)
             if fibers:
                 self._take(about, ops.FiberFrame, hits=hits, **_READ)
-                identity = {"function": "identity", "divisor": None, "factor": None}
-                depth_scale = self._take(depth, ops.Transform, x=displace.z, **identity).scale
+                known = {"x": displace.z, "function": "identity", **_SCALED}
+                depth_scale = self._take(depth, ops.Transform, **known).scale
             if len(rest) >= 3:
                 hints, scale = True, self._hints(rest, shade, unit)
                 del rest[:3]
@@ -164,7 +167,7 @@ class _Matcher:
 
     def _hints(self, rest: Sequence[str], shade: str, unit: str) -> float:
         """Factor of the irradiance under the logarithm."""
-        plain = {"function": "log1p", "factor": None}
-        self._take(rest[2], ops.Transform, x=f"{shade}[3:6]", scale=1.0, divisor=unit, **plain)
+        known = {"function": "log1p", **_SCALED}
+        self._take(rest[2], ops.Transform, x=f"{shade}[3:6]", scale=1.0, **{**known, "divisor": unit})
         self._expect(rest[1] == f"{shade}[1:3]")
-        return self._take(rest[0], ops.Transform, x=f"{shade}[0:1]", divisor=None, **plain).scale
+        return self._take(rest[0], ops.Transform, x=f"{shade}[0:1]", **known).scale

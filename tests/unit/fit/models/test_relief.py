@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from mbtf_core.data.lattice import Lattice
 from mbtf_core.errors import InputError
+from mbtf_fit.backends.cpu.pattern import match
 from mbtf_fit.config import build_model
 from mbtf_fit.material.inference import predict
 from mbtf_fit.pytorch.material import NeuralMaterial
@@ -120,3 +122,11 @@ def test_cloth_reads_the_height_of_the_intersection(name: str, reads: bool) -> N
     deeper[:, 0] -= 0.05
     arrays = (batch.u, batch.sigma, batch.omega_i, batch.omega_o)
     assert bool((model(*arrays, batch.hints) != model(*arrays, deeper)).any()) == reads
+
+
+@pytest.mark.parametrize("name", ["depth", "log_irradiance", "log_core"])
+def test_the_kernel_does_not_take_inputs_with_a_bound(name: str) -> None:
+    """It knows none of them."""
+    operations = model_of("cloth").operations
+    assert match(operations) is not None
+    assert match([replace(op, most="most") if op.output == name else op for op in operations]) is None

@@ -213,6 +213,7 @@ def test_more_places_come_closer_to_the_mean_over_the_footprint() -> None:
     """Of 1000 view rays at Gaussian positions, shaded at the finest level."""
     lattice = Lattice(5)
     known, level = rough_surface(lattice), torch.full((300,), 3.5)
+    sigma = torch.from_numpy(sigma_of_level(level.numpy())).float()
     u, _, light, view = queries(300, lattice)
     trace, shade = known_surface(16)
     everywhere = replace(trace, places=tuple(map(tuple, np.random.default_rng(0).normal(size=(1000, 2)))))
@@ -220,7 +221,7 @@ def test_more_places_come_closer_to_the_mean_over_the_footprint() -> None:
     wanted = known.shading(replace(shade, finer=5.0), hits, level, light, view)
     errors = []
     for places in PLACES:
-        found = hints_of(known, u, 0.5 * torch.exp2(-level), light, view, places=places)[:, 1:]
+        found = hints_of(known, u, sigma, light, view, places=places)[:, 1:]
         errors.append(float((found - wanted).square().mean().sqrt()))
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < 0.6 * errors[0]
