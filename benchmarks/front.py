@@ -81,6 +81,7 @@ PARTS: dict[str, dict[str, dict[str, Any]]] = {
         "four rays": {"relief": {"places": 4}},
         "eight rays": {"relief": {"places": 8}},
         "sixteen rays": {"relief": {"places": 16}},
+        "sixteen rays, shadow rays": {"relief": {"places": 16, "shadow_rays": True}},
         "no gate": {"relief": {"gate": False}},
         "no oversampling": {"oversampling": 1},
         **COMMON,

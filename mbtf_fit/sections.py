@@ -49,6 +49,9 @@ class ReliefSection(Settings):
     places: Literal[1, 2, 4, 8, 16] = Field(
         1, description="view rays that are traced per query, spread over its footprint"
     )
+    shadow_rays: bool = Field(
+        False, description="where a view ray meets the surface, trace a ray to the light besides the horizon"
+    )
     hints: bool = Field(
         True, description="irradiance, normal and single scattering of the known surface as inputs"
     )

@@ -204,12 +204,13 @@ class NumpyMaterial:
         r = r if r.shape[-1] == 2 else r * omega_o[:2] / max(omega_o[2], grazing)
         return u + scale * r / self.scale
 
-    def trace(self, hits, u, level, omega_o, heights, places, **_):
+    def trace(self, hits, depths, u, level, omega_o, heights, places, **_):
         along = unit(omega_o[:2]) if omega_o[:2].any() else np.array([1, 0])
         across, slope = along[::-1] * [-1, 1], omega_o[:2] / omega_o[2] / self.scale
         starts = [u + 0.5 ** (level + 1) * (a * across + b * along) / self.scale for a, b in places]
         z = [intersection(heights[::-1, :, 0], x, slope) for x in starts]
         self.values[hits] = join(*(x + h * slope for x, h in zip(starts, z, strict=True)))
+        self.values[depths] = np.array(z)
         return np.mean(z, keepdims=True)
 
     def displace(self, u, z, level, omega_o, weights):
@@ -219,16 +220,22 @@ class NumpyMaterial:
         return self.lookup(u, level + finer, maps)
 
     def shade(self, hits, level, omega_i, omega_o, maps, horizons, light_width, dielectric, finer, light_blur,
-              least_view, least_variance, alpha2):  # fmt: skip
+              least_view, least_variance, alpha2, shadow_bias, depths=None, heights=None, **_):  # fmt: skip
         hints = []
-        for hit in hits.reshape(-1, 2):
+        sharp = 0 if heights is None else float(np.clip(1 + (level[0] + finer - self.finest) / 2, 0, 1))
+        for k, hit in enumerate(hits.reshape(-1, 2)):
             known, horizon = (self.lookup(hit, level + finer, textures) for textures in (maps, horizons))
             azimuth, moments = np.arctan2(*omega_i[1::-1]) / (2 * np.pi), horizon.reshape(2, -1)
             count = moments.shape[1]
             mean, square = (np.interp(azimuth * count, range(count), x, period=count) for x in moments)
             variance = max(0, square - mean**2) + (light_blur * light_width) ** 2
             over = (np.arcsin(omega_i[2]) - mean) / np.sqrt(2 * max(variance, least_variance))
-            light, c, n, base = (0.5 + 0.5 * erf(over)) / omega_i[2], known[:2], normal(known[:2]), known[5:8]
+            seen = 0.5 + 0.5 * erf(over)
+            if sharp:
+                slope = omega_i[:2] / omega_i[2] / self.scale
+                first = intersection(heights[::-1, :, 0], hit - depths[k] * slope, slope)
+                seen += sharp * ((first <= depths[k] + shadow_bias) - seen)
+            light, c, n, base = seen / omega_i[2], known[:2], normal(known[:2]), known[5:8]
             spread = doubled_scatter(c, known[2:5])
             irradiance = light * n[2] * shown(omega_i, c, spread)
             core, h = irradiance * base / np.pi, unit(omega_i + omega_o)

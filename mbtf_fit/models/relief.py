@@ -55,7 +55,11 @@ class Relief(Model):
         "training": {"residual_levels": True, "texture_weight_decay": 2.0, "blur": {"min_sigma": 1.6}},
     }
     reads_geometry: ClassVar[Sequence[str]] = ("height",)
-    takes = (*PYRAMID, *SHARED, *(f"network.relief.{n}" for n in ("places", "hints", "frame", "gate")))
+    takes = (
+        *PYRAMID,
+        *SHARED,
+        *(f"network.relief.{n}" for n in ("places", "shadow_rays", "hints", "frame", "gate")),
+    )
     # Texture of learned heights, in models that have one.
     learned: ClassVar[str | None] = None
 
@@ -69,7 +73,7 @@ class Relief(Model):
         outputs = network.output_channels
         return [
             # z: where the view ray meets the heights; its hints there.
-            *known_surface(relief.places),
+            *known_surface(relief.places, relief.shadow_rays),
             # (R1) u' = u + w_l z / ω_o,z · ω_o,xy
             Displace("moved", "u", "z", "level", "omega_o", "depth_weights", cls.learned),
             pyramid("moved", network),
@@ -139,9 +143,10 @@ class Relief(Model):
         return self.material(*at, hints=batch.hints), batch
 
 
-def known_surface(places: int) -> tuple[Trace, Shade]:
+def known_surface(places: int, shadow_rays: bool = False) -> tuple[Trace, Shade]:
     """The operations that trace and shade the surface of a material, for so many places of a footprint."""
     offsets, finer = PLACES[places]
-    trace = Trace("z", "hits", "u", "level", "omega_o", HEIGHTS, offsets)
+    trace = Trace("z", "hits", "depths", "u", "level", "omega_o", HEIGHTS, offsets)
     tensors = MAPS, HORIZONS, LIGHT_WIDTH, DIELECTRIC
-    return trace, Shade("surface", "hits", "level", "omega_i", "omega_o", *tensors, finer)
+    shadows = ("depths", HEIGHTS) if shadow_rays else ()
+    return trace, Shade("surface", "hits", "level", "omega_i", "omega_o", *tensors, finer, *shadows)

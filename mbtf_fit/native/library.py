@@ -19,7 +19,7 @@ MAX_CHANNELS, MAX_WIDTH, MAX_LAYERS, MAX_LEVELS, MAX_PLACES = 64, 128, 16, 16, 1
 
 _I32, _I64, _F32, _POINTER = ctypes.c_int32, ctypes.c_int64, ctypes.c_float, ctypes.c_void_p
 # Version of what the functions mean, where sizes of structures do not show it; as in src/kernel.h.
-INTERFACE = 8
+INTERFACE = 9
 
 
 class NetworkStruct(ctypes.Structure):
@@ -79,7 +79,11 @@ class SurfaceStruct(ctypes.Structure):
         *((name, _F32) for name in ("finer", "light_width", "light_blur", "dielectric")),
         *((name, _F32) for name in ("edge", "coat", "least_view")),
         *((name, _F32 * 2) for name in ("albedo_spread", "alpha2", "voigt")),
-        *((name, _F32) for name in ("fiber_finer", "least_tangents", "least_cosine", "least_spread")),
+        *(
+            (name, _F32)
+            for name in ("fiber_finer", "least_tangents", "least_cosine", "least_spread", "shadow_bias")
+        ),
+        ("shadow_rays", _I32),
     )
 
 

@@ -98,13 +98,14 @@ class Trace(Operation):
 
     Attributes
     ----------
-    hits : name of the uv (2 per place) of the intersections
+    hits, depths : names of the uv (2 per place) of the intersections, and of their heights z_j (1 per place)
     u, level, omega_o : position (2), fractional level (1), view (3)
     heights : tensor (rows, columns, 1) in tile widths, at most 0
     places : offsets o_j across and along the view's azimuth, in σ
     """
 
-    hits: Annotated[str, "second output"]
+    hits: Annotated[str, "further output"]
+    depths: Annotated[str, "further output"]
     u: Value
     level: Value
     omega_o: Value
@@ -118,7 +119,7 @@ class Trace(Operation):
     def results(self, sizes: Sequence[int]) -> dict[str, int]:
         if not self.places:
             raise ValueError(f"trace '{self.output}' has no places")
-        return {self.output: 1, self.hits: 2 * len(self.places)}
+        return {self.output: 1, self.hits: 2 * len(self.places), self.depths: len(self.places)}
 
 
 @dataclass(frozen=True)

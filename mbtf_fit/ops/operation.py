@@ -320,7 +320,7 @@ def reached_from(operations: Sequence[Operation], *names: str) -> set[str]:
 
 def output_names(operation: Operation) -> list[str]:
     """Names of the values that an operation computes."""
-    return [operation.output, *operation.named("second output")]
+    return [operation.output, *operation.named("further output")]
 
 
 def stages(operations: Sequence[Operation]) -> tuple[list[Operation], list[Operation]]:

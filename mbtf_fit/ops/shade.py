@@ -8,7 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mbtf_fit.ops.constants import ALPHA2, LEAST_LIGHT, LEAST_VARIANCE, LEAST_VIEW, LIGHT_BLUR
+from mbtf_fit.ops.constants import (
+    ALPHA2,
+    LEAST_LIGHT,
+    LEAST_VARIANCE,
+    LEAST_VIEW,
+    LIGHT_BLUR,
+    MAX_CROSSINGS,
+    SHADOW_BIAS,
+)
 from mbtf_fit.ops.operation import Operation, TensorName, TextureName, Value
 
 
@@ -26,6 +34,13 @@ class Shade(Operation):
     both linear between azimuths; v is their variance. The light is visible from the share
 
         (R2) V = Φ((asin ω_i,z - h) / √max(v + (light_blur · light_width)², least_variance)).
+
+    Of footprints that horizons hardly resolve, a shadow ray tells more. With the height z of the
+    intersection, and the height z' at which the light's ray to it first meets the heights,
+
+        (R11) V = (1 - w) V_h + w [z' ≤ z + shadow_bias],    w = min(max(1 + (l + finer - k) / 2, 0), 1),
+
+    where V_h is that of (R2) and k the finest level. Without `heights`, w = 0.
 
     Facets whose slopes have the center c and the matrix A show to a direction ω, per area of the reference
     plane, the area (Heitz 2014)
@@ -79,6 +94,8 @@ class Shade(Operation):
     maps, horizons : textures by level
     light_width, dielectric : tensors (): RMS angle per axis of the light in radians; F0 of what is no metal
     finer : levels
+    depths, heights : heights of the intersections (1 each), and tensor (rows, columns, 1) that shadow rays
+        are traced to, as by :class:`~mbtf_fit.ops.lookup.Trace`; None for no shadow rays
     """
 
     hits: Value
@@ -90,6 +107,10 @@ class Shade(Operation):
     light_width: TensorName
     dielectric: TensorName
     finer: float = 0.0
+    depths: Value | None = None
+    heights: TensorName | None = None
+    shadow_bias: float = SHADOW_BIAS
+    crossings: int = MAX_CROSSINGS
     light_blur: float = LIGHT_BLUR
     least_view: float = LEAST_VIEW
     least_variance: float = LEAST_VARIANCE

@@ -142,9 +142,15 @@ def _rise(learned: str, run: Execution, u: Tensor, z: Tensor, omega_o: Tensor) -
 
 @PYTORCH.implements(ops.Shade)
 def _shade(
-    op: ops.Shade, run: Execution, hits: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor
+    op: ops.Shade,
+    run: Execution,
+    hits: Tensor,
+    level: Tensor,
+    omega_i: Tensor,
+    omega_o: Tensor,
+    depths: Tensor | None,
 ) -> Tensor:
-    return run.material.known.shading(op, hits, level, omega_i, omega_o)
+    return run.material.known.shading(op, hits, level, omega_i, omega_o, depths)
 
 
 def _ggx(

@@ -67,8 +67,8 @@ def compute_hints(
         parts = []
         for start in range(0, len(u), _CHUNK):
             c = slice(start, start + _CHUNK)
-            height, hits = surface.intersections(trace, u[c], level[c], omega_o[c])
-            found = [height, surface.shading(shade, hits, level[c], omega_i[c], omega_o[c])]
+            height, hits, depths = surface.intersections(trace, u[c], level[c], omega_o[c])
+            found = [height, surface.shading(shade, hits, level[c], omega_i[c], omega_o[c], depths)]
             if fibers is not None:
                 found.append(surface.about_fibers(fibers, hits, level[c], omega_i[c], omega_o[c]))
             parts.append(torch.cat(found, 1))
@@ -87,6 +87,7 @@ def compute_hints(
     description.offsets[: 2 * places] = [x for offset in trace.places for x in offset]
     description.light_width, description.light_blur = surface.light_width, shade.light_blur
     description.dielectric, description.edge = surface.dielectric, grazing_reflectance(surface.dielectric)
+    description.shadow_rays, description.shadow_bias = int(shade.heights is not None), shade.shadow_bias
     description.coat, description.least_view = CLEARCOAT_F0, shade.least_view
     description.albedo_spread[:], description.alpha2[:] = ALBEDO_SPREAD, shade.alpha2
     description.voigt[:] = VOIGT_WIDENING, VOIGT_SCALE

@@ -209,20 +209,23 @@ class KnownSurface:
     def _horizon_copies(self) -> DeviceCopies:
         return DeviceCopies(self.horizon_table[0])
 
-    def intersections(self, trace: Trace, u: Tensor, level: Tensor, omega_o: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean height (n, 1), and uv (n, 2·places), of the intersections of the places' view rays; levels
-        (n,)."""
+    def intersections(
+        self, trace: Trace, u: Tensor, level: Tensor, omega_o: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean height (n, 1), uv (n, 2·places) and heights (n, places) of the intersections of the places'
+        view rays; levels (n,)."""
         sigma = 0.5 * torch.exp2(-level)[:, None]
         aspect = u.new_tensor([1.0, self.lattice.aspect])
-        total, hits = u.new_zeros(len(u), 1), []
+        heights, hits = [], []
         along = _azimuth(omega_o)
         across = torch.stack([-along[:, 1], along[:, 0]], 1)
         for x, y in trace.places:
             at = u + sigma * (x * across + y * along) / aspect
             z = self.tracer.trace(at, omega_o)[:, None]
             hits.append(at + z / omega_o[:, 2:] * omega_o[:, :2] / aspect)
-            total = total + z
-        return total / len(trace.places), torch.cat(hits, 1)
+            heights.append(z)
+        depths = torch.cat(heights, 1)
+        return depths.mean(1, keepdim=True), torch.cat(hits, 1), depths
 
     def read_maps(self, hit: Tensor, level: Tensor) -> Tensor:
         """All numbers of the maps (n, channels) at surface points (n, 2); levels (n,)."""
@@ -236,19 +239,35 @@ class KnownSurface:
         maps = (lookup(table, packing, hit, level + op.finer) for hit in hits.split(2, 1))
         return torch.stack([fiber_frame(op, found, omega_i, omega_o) for found in maps]).mean(0)
 
-    def shading(self, shade: Shade, hits: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
-        """Irradiance, normal (x, y) and core (RGB) (n, 6): means over the intersections (n, 2·places)."""
+    def shading(
+        self,
+        shade: Shade,
+        hits: Tensor,
+        level: Tensor,
+        omega_i: Tensor,
+        omega_o: Tensor,
+        depths: Tensor | None = None,
+    ) -> Tensor:
+        """Irradiance, normal (x, y) and core (RGB) (n, 6): means over the intersections (n, 2·places), whose
+        heights (n, places) shadow rays ask for."""
         finer = level + shade.finer
-        parts = [self._shade(shade, hit, finer, omega_i, omega_o) for hit in hits.split(2, 1)]
+        places = hits.split(2, 1)
+        heights = [None] * len(places) if depths is None else depths.split(1, 1)
+        parts = [
+            self._shade(shade, hit, z, finer, omega_i, omega_o)
+            for hit, z in zip(places, heights, strict=True)
+        ]
         return torch.stack(parts).mean(0)
 
-    def _shade(self, op: Shade, hit: Tensor, level: Tensor, omega_i: Tensor, omega_o: Tensor) -> Tensor:
+    def _shade(
+        self, op: Shade, hit: Tensor, z: Tensor | None, level: Tensor, omega_i: Tensor, omega_o: Tensor
+    ) -> Tensor:
         """Irradiance, normal and core (n, 6) at surface points."""
         maps = self.read_maps(hit, level)
         center, base = maps[:, :2], maps[:, 5:8]
         spread = doubled_scatter(center, maps[:, 2:5])
         normal = torch.nn.functional.normalize(torch.cat([-center, torch.ones_like(center[:, :1])], 1), dim=1)
-        light = self.visibility(op, hit, level, omega_i) / omega_i[:, 2:]
+        light = self.visibility(op, hit, z, level, omega_i) / omega_i[:, 2:]
         irradiance = light * normal[:, 2:] * shown(omega_i, center, spread)
         core = irradiance * base / math.pi
         if not self.glossy:
@@ -290,8 +309,19 @@ class KnownSurface:
             core = core + lobe(alpha2, coat_reflectance(weight, rest))
         return torch.cat([irradiance, normal[:, :2], core], 1)
 
-    def visibility(self, op: Shade, hit: Tensor, level: Tensor, omega_i: Tensor) -> Tensor:
-        """Share (n, 1) of footprints at surface points from which the light is visible."""
+    def visibility(self, op: Shade, hit: Tensor, z: Tensor | None, level: Tensor, omega_i: Tensor) -> Tensor:
+        """Share (n, 1) of footprints at surface points from which the light is visible; z: their heights."""
+        lower = self._lower_horizons(op, hit, level, omega_i)
+        if op.heights is None or z is None:
+            return lower
+        # (R11)
+        start = hit - z / omega_i[:, 2:] * omega_i[:, :2] / hit.new_tensor([1.0, self.lattice.aspect])
+        first = self.tracer.trace(start, omega_i)[:, None]
+        weight = (1.0 + 0.5 * (level - self.lattice.finest)).clamp(0.0, 1.0)[:, None]
+        return torch.lerp(lower, (first <= z + op.shadow_bias).to(lower), weight)
+
+    def _lower_horizons(self, op: Shade, hit: Tensor, level: Tensor, omega_i: Tensor) -> Tensor:
+        """(R2) Share (n, 1) of the horizons of footprints that are lower than the light."""
         both = lookup(self._horizon_copies.on(hit.device), self.horizon_table[1], hit, level)
         count = both.shape[1] // 2
         # A vertical light has azimuth 0, whatever the signs of its zeros.

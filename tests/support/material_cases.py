@@ -34,7 +34,11 @@ CASES: dict[str, dict[str, Any]] = {
         **net(encoding={**BANDS, "band_attenuation": True, "footprint_filtered": True}),
     },
     "relief": {"model": "relief"},
-    "relief, diffuse, four places": {"model": "relief", "glossy": False, **net(relief={"places": 4})},
+    "relief, diffuse, shadow rays": {
+        "model": "relief",
+        "glossy": False,
+        **net(relief={"places": 4, "shadow_rays": True}),
+    },
     "relief under a coat": {"model": "relief", "coated": True, **net(relief={"places": 2})},
     "relief without hints": {"model": "relief", **net(relief={"hints": False}, oversampling=1)},
     "relief without gate": {

@@ -162,7 +162,9 @@ class _Matcher:
         trace = self._take(displace.z, ops.Trace, u="u", level="level", omega_o="omega_o")
         shades = [name for name in self._by_output if self._is(name, ops.Shade)]
         self._expect(len(shades) == 1)
-        self._take(shades[0], ops.Shade, hits=trace.hits, least_variance=LEAST_VARIANCE, **_READ)
+        shade = self._take(shades[0], ops.Shade, hits=trace.hits, least_variance=LEAST_VARIANCE, **_READ)
+        shadows = (shade.depths, shade.heights, shade.crossings)
+        self._expect(shade.heights is None or shadows == (trace.depths, trace.heights, trace.crossings))
         return shades[0], trace.hits
 
     def _hints(self, rest: Sequence[str], shade: str, unit: str) -> float:

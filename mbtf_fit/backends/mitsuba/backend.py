@@ -13,10 +13,13 @@ from typing import Any, Literal
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from mbtf_core.data.lattice import Lattice
+from mbtf_core.errors import InputError
 from mbtf_fit.backends.mitsuba.stored_material import F32, StoredMaterial
 from mbtf_fit.backends.mitsuba.textures import Textures
+from mbtf_fit.material.format import WEIGHTS_NAME
 from mbtf_fit.ops import Backend, Operation
 from mbtf_fit.ops.operation import input_sizes
 from mbtf_gen.engine.types import Float
@@ -52,6 +55,23 @@ class Loader:
     def lattice(self) -> Lattice:
         """Texel grids of the tile."""
         return self.stored.lattice
+
+    def heightfield(self, name: str) -> HeightfieldGeometry:
+        """Heights that rays are traced to.
+
+        Raises
+        ------
+        InputError : they are none
+        """
+        known = self.heightfields
+        if name not in known:
+            heights = self.stored.take(name, (None, None, 1))[..., 0]
+            if heights.size == 0 or heights.max() > 0:
+                fault = "is empty" if heights.size == 0 else "has heights above the reference plane"
+                raise InputError(f"its tensor '{name}' {fault}", where=self.stored.folder / WEIGHTS_NAME)
+            aspect, z = self.lattice.aspect, heights.astype(np.float64)
+            known[name] = HeightfieldGeometry.of(z, aspect, 1.0, two_sided=False)
+        return known[name]
 
     def inputs(self, op: Operation) -> list[int]:
         """Sizes of an operation's inputs."""

@@ -7,13 +7,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from mbtf_core.errors import InputError
 from mbtf_fit import ops
 from mbtf_fit.backends.mitsuba.backend import MITSUBA, Loader, Numbers, Step
 from mbtf_fit.backends.mitsuba.shell import Shell, displaced
-from mbtf_fit.material.format import WEIGHTS_NAME
 from mbtf_gen.engine.types import Float, UInt32
-from mbtf_gen.tile.tracers.heightfield_tracer import HeightfieldGeometry
 
 
 @MITSUBA.implements(ops.Lookup)
@@ -74,31 +71,18 @@ def _offset(op: ops.Offset, loader: Loader) -> Step:
 def _trace(op: ops.Trace, loader: Loader) -> Step:
     shell = shell_of(op, loader)
 
-    def step(u: Numbers, level: Numbers, omega_o: Numbers) -> tuple[Numbers, Numbers]:
+    def step(u: Numbers, level: Numbers, omega_o: Numbers) -> tuple[Numbers, Numbers, Numbers]:
         places = list(shell.places(u, level[0], omega_o))
         heights = shell.flat_heights(places, omega_o)
         hits = [displaced(at, z, omega_o, shell.aspect) for at, z in zip(places, heights, strict=True)]
-        return [sum(heights) / len(heights)], [x for hit in hits for x in hit]
+        return [sum(heights) / len(heights)], [x for hit in hits for x in hit], heights
 
     return step
 
 
 def shell_of(op: ops.Trace, loader: Loader) -> Shell:
-    """The heights that an operation traces.
-
-    Raises
-    ------
-    InputError : they are none
-    """
-    aspect, known = loader.lattice.aspect, loader.heightfields
-    if op.heights in known:
-        return Shell(op, known[op.heights], aspect)
-    heights = loader.stored.take(op.heights, (None, None, 1))[..., 0]
-    if heights.size == 0 or heights.max() > 0:
-        fault = "is empty" if heights.size == 0 else "has heights above the reference plane"
-        raise InputError(f"its tensor '{op.heights}' {fault}", where=loader.stored.folder / WEIGHTS_NAME)
-    known[op.heights] = HeightfieldGeometry.of(heights.astype(np.float64), aspect, 1.0, two_sided=False)
-    return Shell(op, known[op.heights], aspect)
+    """The heights that an operation traces."""
+    return Shell(op, loader.heightfield(op.heights), loader.lattice.aspect)
 
 
 @MITSUBA.implements(ops.Displace)

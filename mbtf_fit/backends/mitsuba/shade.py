@@ -13,11 +13,13 @@ import numpy as np
 from mbtf_core.data.schema import CLEARCOAT_F0
 from mbtf_core.errors import InputError
 from mbtf_fit import ops
-from mbtf_fit.backends.mitsuba.arcs import tilt
+from mbtf_fit.backends.mitsuba.arcs import on_top, tilt
 from mbtf_fit.backends.mitsuba.backend import MITSUBA, Loader, Numbers, Step, opaque
 from mbtf_fit.backends.mitsuba.curvature import DEEPEST
 from mbtf_fit.backends.mitsuba.frame import Frame
+from mbtf_fit.backends.mitsuba.shell import displaced
 from mbtf_fit.backends.mitsuba.textures import Textures
+from mbtf_fit.backends.mitsuba.view_rays import heights_below
 from mbtf_fit.material.format import WEIGHTS_NAME
 from mbtf_fit.ops.constants import (
     ALBEDO_SPREAD,
@@ -59,6 +61,10 @@ class DirectLight:
     curvature: Vector3f
     depth: Float
     heights: Sequence[Float]
+
+    def towards(self, omega_i: Vector3f) -> Vector3f:
+        """Towards the light, given the direction of the plane's data."""
+        return dr.select(self.flat, omega_i, self.omega_i)
 
     @property
     def bend(self) -> Float:
@@ -118,10 +124,10 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
     dielectric, grazing = opaque(f0), opaque(grazing_reflectance(f0))
     blur, width2 = opaque((op.light_blur * width) ** 2), opaque(width**2)
 
-    def visibility(
+    def lower_horizons(
         hit: Point2f, level: Float, omega_i: Vector3f, lit: DirectLight | None, place: int
     ) -> Float:
-        """Share of footprints from which the light is visible."""
+        """(R2) Share of the horizons of footprints that are lower than the light."""
         count = horizons.groups
         azimuth = dr.atan2(omega_i.y, omega_i.x) * (count / (2.0 * math.pi))
         azimuth -= count * dr.floor(azimuth / count)
@@ -146,10 +152,32 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         inside = dr.maximum(visible - (1.0 - lit.reach) * lower(lit.lowest), 0.0)
         return dr.select(lit.flat, visible, inside)
 
-    def at(
-        hit: Point2f,
-        found: Numbers,
+    def visibilities(
+        hits: Sequence[Point2f],
+        depths: Numbers | None,
         level: Float,
+        omega_i: Vector3f,
+        lit: DirectLight | None,
+    ) -> list[Float]:
+        """(R11) Visibility of the light from each place: by shadow rays where horizons do not resolve the
+        footprint, on a plane."""
+        towards = omega_i if lit is None else lit.towards(omega_i)
+        lower = [lower_horizons(hit, level, towards, lit, k) for k, hit in enumerate(hits)]
+        if op.heights is None or depths is None:
+            return lower
+        weight = dr.clip(dr.fma(0.5, level - float(loader.lattice.finest), 1.0), 0.0, 1.0)
+        if lit is not None:
+            weight = dr.select(lit.flat, weight, 0.0)
+        aspect = loader.lattice.aspect
+        tops = (displaced(hit, -z, omega_i, aspect) for hit, z in zip(hits, depths, strict=True))
+        rays = [mi.Ray3f(on_top(top, aspect), -omega_i) for top in tops]
+        found = heights_below(loader.heightfield(op.heights), rays, op.crossings, weight > 0.0)
+        reached = (dr.select(h <= z + op.shadow_bias, 1.0, 0.0) for h, z in zip(found, depths, strict=True))
+        return [dr.lerp(a, b, weight) for a, b in zip(lower, reached, strict=True)]
+
+    def at(
+        found: Numbers,
+        seen: Float,
         omega_i: Vector3f,
         omega_o: Vector3f,
         frame: Frame | None,
@@ -159,8 +187,8 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         x, y, *moments = found[:5]
         center, spread, base = mi.Vector2f(x, y), _spread(x, y, *moments), mi.Color3f(*found[5:8])
         upright = dr.rsqrt(1.0 + dr.squared_norm(center))
-        towards = omega_i if lit is None else dr.select(lit.flat, omega_i, lit.omega_i)
-        light = visibility(hit, level, towards, lit, place) / omega_i.z
+        towards = omega_i if lit is None else lit.towards(omega_i)
+        light = seen / omega_i.z
         facing = light * _shown(towards, center, spread)
         hints = [upright * facing, -upright * x, -upright * y]
         if frame is not None:
@@ -211,15 +239,18 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         level: Numbers,
         omega_i: Numbers,
         omega_o: Numbers,
+        depths: Numbers | None,
         frame: Frame | None = None,
         lit: DirectLight | None = None,
     ) -> Numbers:
         places = [mi.Point2f(*hits[k : k + 2]) for k in range(0, len(hits), 2)]
-        common = (level[0] + op.finer, mi.Vector3f(*omega_i), mi.Vector3f(*omega_o))
-        read = [maps.blended(hit, common[0]) for hit in places]
+        finer, light, view = level[0] + op.finer, mi.Vector3f(*omega_i), mi.Vector3f(*omega_o)
+        seen = visibilities(places, depths, finer, light, lit)
+        read = [maps.blended(hit, finer) for hit in places]
         # A basic block of its own: four places in one spill registers, which takes 5% of the kernel's time.
         dr.detail.new_scope(dr.backend_v(mi.Float))
-        parts = [at(hit, read[k], *common, frame, lit, k) for k, hit in enumerate(places)]
+        shared = (light, view, frame, lit)
+        parts = [at(read[k], seen[k], *shared, k) for k in range(len(places))]
         return [sum(column) / len(parts) for column in zip(*parts, strict=True)]
 
     return step

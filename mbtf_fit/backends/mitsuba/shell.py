@@ -143,11 +143,12 @@ class Shell:
         still = flat | (omega_o.z <= 0.0)
         there = dr.select(still, omega_o, clamped(over(bend), min_cos))
         before = displaced([x, y], -z, there, self.aspect)
+        heights = [dr.select(hit, height, z) for hit, height, *_ in found]
         return ShellHit(
             self,
             count / len(found),
             dr.select(still, u, mi.Point2f(*before)),
-            [dr.select(hit, height, z) for hit, height, *_ in found],
+            heights,
             curvature,
             flat,
             bend,
@@ -155,7 +156,7 @@ class Shell:
             # met the bottom; none stays that left.
             ~flat & (arc.curvature > 0.0) & (rise < 4.0 * self.depth),
             there,
-            {self.op.output: [z], self.op.hits: hits},
+            {self.op.output: [z], self.op.hits: hits, self.op.depths: heights},
         )
 
 

@@ -55,25 +55,35 @@ def _offset(op: ops.Offset, code: Code, u: Value, r: Value, omega_o: Value) -> s
 
 
 @SHADER.implements(ops.Trace)
-def _trace(op: ops.Trace, code: Code, u: Value, level: Value, omega_o: Value) -> tuple[Value, Value]:
-    code.include("heights")
-    nodes = code.image(op.heights, "nodes")
-    rows, columns = nodes.levels[0].shape[:2]
-    logarithms = ", ".join(str((n - 1).bit_length()) for n in (columns, rows))
-    count = len(op.places)
-    grid = f"Grid(int2({columns}, {rows}), int2({logarithms}), ASPECT)"
+def _trace(op: ops.Trace, code: Code, u: Value, level: Value, omega_o: Value) -> tuple[Value, ...]:
+    nodes, count = _nodes(code, op.heights), len(op.places)
     places = code.constants("float2", "places", [vector(place) for place in op.places])
     mean, hits = code.variable("float", op.output), code.variable("float2", op.hits, count)
+    depths = code.variable("float", op.depths, count)
     code.write(
         f"{mean} = 0.0;",
         f"for (int k = 0; k < {count}; k++) {{",
         f"  float2 at = place_of({u}, {level}, {places}[k], {omega_o}, ASPECT);",
-        f"  float z = trace({nodes}, {grid}, {op.crossings}, at, {omega_o});",
+        f"  float z = trace({nodes}, {op.crossings}, at, {omega_o});",
+        f"  {depths}[k] = z;",
         f"  {hits}[k] = displaced(at, z, {omega_o}, ASPECT);",
         f"  {mean} += z / {number(count)};",
         "}",
     )
-    return Value.of(mean, 1, code.lit), Value.of_array(hits, 2 * count, code.lit, width=2)
+    return (
+        Value.of(mean, 1, code.lit),
+        Value.of_array(hits, 2 * count, code.lit, width=2),
+        Value.of_array(depths, count, code.lit, width=1),
+    )
+
+
+def _nodes(code: Code, heights: str) -> str:
+    """Table and grid of heights, the first arguments of a ray."""
+    code.include("heights")
+    nodes = code.image(heights, "nodes")
+    rows, columns = nodes.levels[0].shape[:2]
+    logarithms = ", ".join(str((n - 1).bit_length()) for n in (columns, rows))
+    return f"{nodes}, Grid(int2({columns}, {rows}), int2({logarithms}), ASPECT)"
 
 
 @SHADER.implements(ops.Displace)
@@ -87,7 +97,15 @@ def _displace(op: ops.Displace, code: Code, u: Value, z: Value, level: Value, om
 
 
 @SHADER.implements(ops.Shade)
-def _shade(op: ops.Shade, code: Code, hits: Value, level: Value, omega_i: Value, omega_o: Value) -> Value:
+def _shade(
+    op: ops.Shade,
+    code: Code,
+    hits: Value,
+    level: Value,
+    omega_i: Value,
+    omega_o: Value,
+    depths: Value | None,
+) -> Value:
     code.include("textures")
     code.include("shading")
     maps = code.image(op.maps, "maps")
@@ -119,6 +137,19 @@ def _shade(op: ops.Shade, code: Code, hits: Value, level: Value, omega_i: Value,
         core = f"coated({core}, {coats}[k], at, {coat_f0}, light, widening, {omega_i}, {omega_o})"
     hints, sum_ = code.variable("float3", op.output), code.variable("float3", op.output)
     blur = f"{number((op.light_blur * width) ** 2)}, {number(op.least_variance)}"
+    reached = []
+    if op.heights is not None and depths is not None:
+        nodes, points = _nodes(code, op.heights), code.variable("float3", "points", count, kept=False)
+        finest = number(1.0 + 0.5 * (op.finer - (len(horizons.levels) - 1)))
+        sharp = code.let("float", f"clamp({finest} + 0.5 * {level}, 0.0, 1.0)", "sharp")
+        code.write(
+            *(
+                f"{points}[{k}] = float3({hits[2 * k : 2 * k + 2]}, {depths[k : k + 1]});"
+                for k in range(count)
+            )
+        )
+        ray = f"{nodes}, {op.crossings}, {points}[k], {number(op.shadow_bias)}, {omega_i}"
+        reached = [f"  if ({sharp} > 0.0) light = lerp(light, reached({ray}), {sharp});"]
     code.write(
         f"{hints} = float3(0.0, 0.0, 0.0);",
         f"{sum_} = float3(0.0, 0.0, 0.0);",
@@ -126,8 +157,9 @@ def _shade(op: ops.Shade, code: Code, hits: Value, level: Value, omega_i: Value,
         f"for (int k = 0; k < {count}; k++) {{",
         f"  Place at = {places}[k];",
         "  float3 normal = normal_of(at);",
-        f"  float light = visibility({horizons}, {horizons.layers}, at.horizons, {blur}, {omega_i})"
-        f" / {omega_i[2:]};",
+        f"  float light = lower_horizons({horizons}, {horizons.layers}, at.horizons, {blur}, {omega_i});",
+        *reached,
+        f"  light /= {omega_i[2:]};",
         f"  float irradiance = light * normal.z * shown_area({omega_i}, at.center, at.spread);",
         f"  {hints} += float3(irradiance, normal.xy) / {number(count)};",
         f"  {sum_} += ({core}) / {number(count)};",

@@ -53,6 +53,8 @@ static void find(const mbtf_textures *t, float level, float u, float v, place *p
 /* Where a view ray meets the surface: rows that are read there. */
 typedef struct {
     float z;
+    /* Whether a shadow ray reaches the light, and the weight of that. */
+    float lit, sharp;
     place maps, horizons, fibers;
 } hit;
 
@@ -62,8 +64,8 @@ static void prefetch(const mbtf_textures *t, const place *p) {
         for (int c = 0; c < t->channels; c += 16) __builtin_prefetch(t->table + p->rows[k] * t->channels + c);
 }
 
-/* Share of the footprint that sees the light. */
-static float visibility(const mbtf_surface *s, const place *p, const float *light) {
+/* Share of the footprint's horizons that are lower than the light. */
+static float lower_horizons(const mbtf_surface *s, const place *p, const float *light) {
     const int count = s->horizons.channels / 2;
     /* A vertical light has azimuth 0, whatever the signs of its zeros. */
     float azimuth = atan2f(light[1] + 0.0f, light[0] + 0.0f) * ((float)count / (2.0f * PI));
@@ -197,7 +199,8 @@ static void shade(const mbtf_surface *s, const hit *h, const float *i, const flo
     }
     const float nz = 1.0f / sqrtf(m[0] * m[0] + m[1] * m[1] + 1.0f);
     const matrix a = spread(m);
-    const float light = visibility(s, &h->horizons, i) / i[2];
+    const float lower = h->sharp < 1.0f ? lower_horizons(s, &h->horizons, i) : 0.0f;
+    const float light = (lower + h->sharp * (h->lit - lower)) / i[2];
     const projection lit = project(i, m[0], m[1], a);
     const float irradiance = light * nz * shown(lit);
     float core[3];
@@ -286,7 +289,7 @@ static void about_fibers(const mbtf_surface *s, const hit *h, const float *i, co
     sum[5] += coverage;
 }
 
-/* Traces one view ray of a query. */
+/* Traces one view ray of a query, and from there a shadow ray. */
 static void meet(const mbtf_surface *s, const mbtf_queries *q, int64_t k, int p, float top, int32_t most, hit *h) {
     const float aspect = s->heightfield.aspect, *u = q->u + 2 * k, *o = q->omega_o + 3 * k;
     const float size = 2.0f * q->sigma[k];
@@ -298,10 +301,17 @@ static void meet(const mbtf_surface *s, const mbtf_queries *q, int64_t k, int p,
     const float across = sigma * s->offsets[2 * p], along = sigma * s->offsets[2 * p + 1];
     const float x = u[0] + along * ax - across * ay, y = u[1] + (along * ay + across * ax) / aspect;
     h->z = mbtf_height(&s->heightfield, x, y, o, most);
-    const float t = h->z / o[2], at = level + s->finer;
-    find(&s->maps, at, x + t * o[0], y + t * o[1] / aspect, &h->maps);
-    find(&s->horizons, at, x + t * o[0], y + t * o[1] / aspect, &h->horizons);
-    if (s->fibers.levels) find(&s->fibers, level + s->fiber_finer, x + t * o[0], y + t * o[1] / aspect, &h->fibers);
+    const float t = h->z / o[2], at = level + s->finer, hx = x + t * o[0], hy = y + t * o[1] / aspect;
+    find(&s->maps, at, hx, hy, &h->maps);
+    h->sharp = s->shadow_rays ? clamped(1.0f + 0.5f * (at - top), 0.0f, 1.0f) : 0.0f;
+    if (h->sharp < 1.0f) find(&s->horizons, at, hx, hy, &h->horizons);
+    h->lit = 0.0f;
+    if (h->sharp > 0.0f) {
+        const float *i = q->omega_i + 3 * k, down = h->z / i[2];
+        const float first = mbtf_height(&s->heightfield, hx - down * i[0], hy - down * i[1] / aspect, i, most);
+        h->lit = first <= h->z + s->shadow_bias ? 1.0f : 0.0f;
+    }
+    if (s->fibers.levels) find(&s->fibers, level + s->fiber_finer, hx, hy, &h->fibers);
 }
 
 /* Hints (n, HINTS) of queries, with fibers (n, HINTS + FIBER_HINTS); `top` is the finest level of the data. Rows of some queries are on their way from
@@ -326,7 +336,7 @@ EXPORT void mbtf_hints(const mbtf_surface *s, const mbtf_queries *q, float top, 
         if (ray >= rays) continue;
         meet(s, q, ray / places, (int)(ray % places), top, most, h);
         prefetch(&s->maps, &h->maps);
-        prefetch(&s->horizons, &h->horizons);
+        if (h->sharp < 1.0f) prefetch(&s->horizons, &h->horizons);
         if (s->fibers.levels) prefetch(&s->fibers, &h->fibers);
     }
 }

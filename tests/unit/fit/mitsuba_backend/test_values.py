@@ -128,7 +128,7 @@ def test_vertical_light_has_the_azimuth_0(tmp_path: Path) -> None:
         found += [plugin.evaluate(*queries.values()), material.evaluate(*queries.values())]
         assert material.model.tracing is not None
         shade = material.model.tracing[1]
-        visible.append(material.model.known.visibility(shade, u, level, light).numpy())
+        visible.append(material.model.known.visibility(shade, u, None, level, light).numpy())
     assert np.ptp(visible[0]) > 0.2
     for shares in visible[1:]:
         np.testing.assert_allclose(shares, visible[0], atol=1e-6)

@@ -35,6 +35,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no gate": {"relief": {"gate": False}},
     "no hints": {"relief": {"hints": False}},
     "wide": {"width": 31, "channels": 11, "layers": 3, "encoding": {"direction_xyz": False}},
+    "shadow rays": {"relief": {"places": 2, "shadow_rays": True}},
     "cloth": {"relief": {"places": 2}},
     "cloth without frame": {"relief": {"frame": False, "gate": False}},
 }
