@@ -115,6 +115,24 @@ def test_horizons_of_convex_surfaces_let_low_light_in(tmp_path: Path) -> None:
     assert found[0] < 0.9 * found[1] < 0.81 * found[2]
 
 
+def test_shadow_rays_are_those_of_a_plane(tmp_path: Path) -> None:
+    """Curved surfaces keep their horizons. A quarter of the lanes is flat."""
+    u = mi.Point2f(np.random.default_rng(0).random((2, 400)).astype(np.float32))
+    flat = mi.Bool(np.arange(400) % 4 == 0)
+    lit = replace(lit_from(0.1, 0.5, -0.1, DEPTH, places=4), flat=flat)
+    found = []
+    for shadow_rays in (False, True):
+        relief = {"places": 4, "shadow_rays": shadow_rays}
+        folder = tmp_path / str(shadow_rays)
+        write_material(folder, model="relief", finest=3, network={"relief": relief})
+        stored = read_material(folder)
+        evaluator, shade = Evaluator(stored), next(op for op in stored.operations if isinstance(op, Shade))
+        values = evaluator.stage1(u, mi.Float(3.0), mi.Vector3f(0.0, 0.6, 0.8))
+        found.append(np.array(evaluator.stage2(values, lit.omega_i, lit)[shade.output][0]))
+    np.testing.assert_array_equal(found[0][~np.array(flat)], found[1][~np.array(flat)])
+    assert np.abs(found[0] - found[1])[np.array(flat)].mean() > 0.02
+
+
 def test_light_from_below_the_plane(tmp_path: Path) -> None:
     """It reaches nothing below all horizons, and above them, less of what others scatter than the network
     says, which saw no such light."""
