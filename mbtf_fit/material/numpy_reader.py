@@ -220,9 +220,8 @@ class NumpyMaterial:
         return self.lookup(u, level + finer, maps)
 
     def shade(self, hits, level, omega_i, omega_o, maps, horizons, light_width, dielectric, finer, light_blur,
-              least_view, least_variance, alpha2, shadow_bias, depths=None, heights=None, **_):  # fmt: skip
+              least_view, least_variance, alpha2, light_depth, depths=None, heights=None, **_):  # fmt: skip
         hints = []
-        sharp = 0 if heights is None else float(np.clip(1 + (level[0] + finer - self.finest) / 2, 0, 1))
         for k, hit in enumerate(hits.reshape(-1, 2)):
             known, horizon = (self.lookup(hit, level + finer, textures) for textures in (maps, horizons))
             azimuth, moments = np.arctan2(*omega_i[1::-1]) / (2 * np.pi), horizon.reshape(2, -1)
@@ -231,10 +230,11 @@ class NumpyMaterial:
             variance = max(0, square - mean**2) + (light_blur * light_width) ** 2
             over = (np.arcsin(omega_i[2]) - mean) / np.sqrt(2 * max(variance, least_variance))
             seen = 0.5 + 0.5 * erf(over)
-            if sharp:
+            if heights is not None:
                 slope = omega_i[:2] / omega_i[2] / self.scale
                 first = intersection(heights[::-1, :, 0], hit - depths[k] * slope, slope)
-                seen += sharp * ((first <= depths[k] + shadow_bias) - seen)
+                below = max(0, first - depths[k]) / omega_i[2]
+                seen = 0.5 * (seen + np.exp(-below / light_depth))
             light, c, n, base = seen / omega_i[2], known[:2], normal(known[:2]), known[5:8]
             spread = doubled_scatter(c, known[2:5])
             irradiance = light * n[2] * shown(omega_i, c, spread)

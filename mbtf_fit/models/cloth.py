@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 from mbtf_fit.models.relief import Relief
 from mbtf_fit.ops import FiberFrame, Operation, Transform
-from mbtf_fit.ops.constants import DEPTH_SCALE, FIBERS, PLACES
+from mbtf_fit.ops.constants import CLOTH_LIGHT_DEPTH, DEPTH_SCALE, FIBERS, PLACES
 from mbtf_fit.sections import NetworkSection
 
 
@@ -37,6 +37,7 @@ class Cloth(Relief):
         },
     }
     reads_geometry: ClassVar[Sequence[str]] = ("height", "tangent_moment.xx")
+    light_depth = CLOTH_LIGHT_DEPTH
 
     @classmethod
     def surface_inputs(cls, network: NetworkSection) -> tuple[list[Operation], list[str]]:

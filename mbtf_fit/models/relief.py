@@ -29,6 +29,7 @@ from mbtf_fit.ops.constants import (
     HINTS,
     HORIZONS,
     IRRADIANCE_SCALE,
+    LIGHT_DEPTH,
     LIGHT_WIDTH,
     MAPS,
     PLACES,
@@ -62,6 +63,7 @@ class Relief(Model):
     )
     # Texture of learned heights, in models that have one.
     learned: ClassVar[str | None] = None
+    light_depth: ClassVar[float] = LIGHT_DEPTH
 
     @classmethod
     def operations(cls, lattice: Lattice, network: NetworkSection) -> list[Operation]:
@@ -73,7 +75,7 @@ class Relief(Model):
         outputs = network.output_channels
         return [
             # z: where the view ray meets the heights; its hints there.
-            *known_surface(relief.places, relief.shadow_rays),
+            *known_surface(relief.places, cls.light_depth if relief.shadow_rays else None),
             # (R1) u' = u + w_l z / ω_o,z · ω_o,xy
             Displace("moved", "u", "z", "level", "omega_o", "depth_weights", cls.learned),
             pyramid("moved", network),
@@ -143,10 +145,11 @@ class Relief(Model):
         return self.material(*at, hints=batch.hints), batch
 
 
-def known_surface(places: int, shadow_rays: bool = False) -> tuple[Trace, Shade]:
-    """The operations that trace and shade the surface of a material, for so many places of a footprint."""
+def known_surface(places: int, light_depth: float | None = None) -> tuple[Trace, Shade]:
+    """The operations that trace and shade the surface of a material, for so many places of a footprint; with
+    shadow rays where the depth of the light is given."""
     offsets, finer = PLACES[places]
     trace = Trace("z", "hits", "depths", "u", "level", "omega_o", HEIGHTS, offsets)
     tensors = MAPS, HORIZONS, LIGHT_WIDTH, DIELECTRIC
-    shadows = ("depths", HEIGHTS) if shadow_rays else ()
+    shadows = () if light_depth is None else ("depths", HEIGHTS, light_depth)
     return trace, Shade("surface", "hits", "level", "omega_i", "omega_o", *tensors, finer, *shadows)

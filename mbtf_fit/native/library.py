@@ -79,11 +79,8 @@ class SurfaceStruct(ctypes.Structure):
         *((name, _F32) for name in ("finer", "light_width", "light_blur", "dielectric")),
         *((name, _F32) for name in ("edge", "coat", "least_view")),
         *((name, _F32 * 2) for name in ("albedo_spread", "alpha2", "voigt")),
-        *(
-            (name, _F32)
-            for name in ("fiber_finer", "least_tangents", "least_cosine", "least_spread", "shadow_bias")
-        ),
-        ("shadow_rays", _I32),
+        *((name, _F32) for name in ("fiber_finer", "least_tangents", "least_cosine", "least_spread")),
+        ("light_depth", _F32),
     )
 
 

@@ -14,8 +14,8 @@ from mbtf_fit.ops.constants import (
     LEAST_VARIANCE,
     LEAST_VIEW,
     LIGHT_BLUR,
+    LIGHT_DEPTH,
     MAX_CROSSINGS,
-    SHADOW_BIAS,
 )
 from mbtf_fit.ops.operation import Operation, TensorName, TextureName, Value
 
@@ -35,12 +35,10 @@ class Shade(Operation):
 
         (R2) V = Φ((asin ω_i,z - h) / √max(v + (light_blur · light_width)², least_variance)).
 
-    Of footprints that horizons hardly resolve, a shadow ray tells more. With the height z of the
-    intersection, and the height z' at which the light's ray to it first meets the heights,
+    With `heights`, V is the mean of that and of a second estimate. The light's ray to an intersection at the
+    height z first meets the heights at z', and is weakened from there,
 
-        (R11) V = (1 - w) V_h + w [z' ≤ z + shadow_bias],    w = min(max(1 + (l + finer - k) / 2, 0), 1),
-
-    where V_h is that of (R2) and k the finest level. Without `heights`, w = 0.
+        (R11) V' = exp(-(z' - z) / (ω_i,z light_depth)).
 
     Facets whose slopes have the center c and the matrix A show to a direction ω, per area of the reference
     plane, the area (Heitz 2014)
@@ -109,7 +107,7 @@ class Shade(Operation):
     finer: float = 0.0
     depths: Value | None = None
     heights: TensorName | None = None
-    shadow_bias: float = SHADOW_BIAS
+    light_depth: float = LIGHT_DEPTH
     crossings: int = MAX_CROSSINGS
     light_blur: float = LIGHT_BLUR
     least_view: float = LEAST_VIEW

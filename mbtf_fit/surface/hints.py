@@ -87,7 +87,7 @@ def compute_hints(
     description.offsets[: 2 * places] = [x for offset in trace.places for x in offset]
     description.light_width, description.light_blur = surface.light_width, shade.light_blur
     description.dielectric, description.edge = surface.dielectric, grazing_reflectance(surface.dielectric)
-    description.shadow_rays, description.shadow_bias = int(shade.heights is not None), shade.shadow_bias
+    description.light_depth = 0.0 if shade.heights is None else shade.light_depth
     description.coat, description.least_view = CLEARCOAT_F0, shade.least_view
     description.albedo_spread[:], description.alpha2[:] = ALBEDO_SPREAD, shade.alpha2
     description.voigt[:] = VOIGT_WIDENING, VOIGT_SCALE

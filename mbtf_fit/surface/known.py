@@ -317,8 +317,8 @@ class KnownSurface:
         # (R11)
         start = hit - z / omega_i[:, 2:] * omega_i[:, :2] / hit.new_tensor([1.0, self.lattice.aspect])
         first = self.tracer.trace(start, omega_i)[:, None]
-        weight = (1.0 + 0.5 * (level - self.lattice.finest)).clamp(0.0, 1.0)[:, None]
-        return torch.lerp(lower, (first <= z + op.shadow_bias).to(lower), weight)
+        below = (first - z).clamp_min(0.0) / omega_i[:, 2:]
+        return 0.5 * (lower + torch.exp(-below / op.light_depth))
 
     def _lower_horizons(self, op: Shade, hit: Tensor, level: Tensor, omega_i: Tensor) -> Tensor:
         """(R2) Share (n, 1) of the horizons of footprints that are lower than the light."""

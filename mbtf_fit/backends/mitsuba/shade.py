@@ -159,21 +159,19 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         omega_i: Vector3f,
         lit: DirectLight | None,
     ) -> list[Float]:
-        """(R11) Visibility of the light from each place: by shadow rays where horizons do not resolve the
-        footprint, on a plane."""
+        """(R11) Visibility of the light from each place: by shadow rays too on a plane."""
         towards = omega_i if lit is None else lit.towards(omega_i)
         lower = [lower_horizons(hit, level, towards, lit, k) for k, hit in enumerate(hits)]
         if op.heights is None or depths is None:
             return lower
-        weight = dr.clip(dr.fma(0.5, level - float(loader.lattice.finest), 1.0), 0.0, 1.0)
-        if lit is not None:
-            weight = dr.select(lit.flat, weight, 0.0)
+        flat = mi.Mask(True) if lit is None else lit.flat
         aspect = loader.lattice.aspect
         tops = (displaced(hit, -z, omega_i, aspect) for hit, z in zip(hits, depths, strict=True))
         rays = [mi.Ray3f(on_top(top, aspect), -omega_i) for top in tops]
-        found = heights_below(loader.heightfield(op.heights), rays, op.crossings, weight > 0.0)
-        reached = (dr.select(h <= z + op.shadow_bias, 1.0, 0.0) for h, z in zip(found, depths, strict=True))
-        return [dr.lerp(a, b, weight) for a, b in zip(lower, reached, strict=True)]
+        found = heights_below(loader.heightfield(op.heights), rays, op.crossings, flat)
+        rate = -dr.rcp(omega_i.z * op.light_depth)
+        lit_by_ray = (dr.exp(rate * dr.maximum(top - z, 0.0)) for top, z in zip(found, depths, strict=True))
+        return [dr.select(flat, 0.5 * (a + b), a) for a, b in zip(lower, lit_by_ray, strict=True)]
 
     def at(
         found: Numbers,

@@ -137,19 +137,13 @@ def _shade(
         core = f"coated({core}, {coats}[k], at, {coat_f0}, light, widening, {omega_i}, {omega_o})"
     hints, sum_ = code.variable("float3", op.output), code.variable("float3", op.output)
     blur = f"{number((op.light_blur * width) ** 2)}, {number(op.least_variance)}"
-    reached = []
+    reaching = []
     if op.heights is not None and depths is not None:
-        nodes, points = _nodes(code, op.heights), code.variable("float3", "points", count, kept=False)
-        finest = number(1.0 + 0.5 * (op.finer - (len(horizons.levels) - 1)))
-        sharp = code.let("float", f"clamp({finest} + 0.5 * {level}, 0.0, 1.0)", "sharp")
-        code.write(
-            *(
-                f"{points}[{k}] = float3({hits[2 * k : 2 * k + 2]}, {depths[k : k + 1]});"
-                for k in range(count)
-            )
-        )
-        ray = f"{nodes}, {op.crossings}, {points}[k], {number(op.shadow_bias)}, {omega_i}"
-        reached = [f"  if ({sharp} > 0.0) light = lerp(light, reached({ray}), {sharp});"]
+        points = code.variable("float3", "points", count, kept=False)
+        uv_and_z = (f"float3({hits[2 * k : 2 * k + 2]}, {depths[k : k + 1]})" for k in range(count))
+        code.write(*(f"{points}[{k}] = {point};" for k, point in enumerate(uv_and_z)))
+        ray = f"{_nodes(code, op.heights)}, {op.crossings}, {points}[k], {number(op.light_depth)}, {omega_i}"
+        reaching = [f"  light = 0.5 * (light + reaching({ray}));"]
     code.write(
         f"{hints} = float3(0.0, 0.0, 0.0);",
         f"{sum_} = float3(0.0, 0.0, 0.0);",
@@ -158,7 +152,7 @@ def _shade(
         f"  Place at = {places}[k];",
         "  float3 normal = normal_of(at);",
         f"  float light = lower_horizons({horizons}, {horizons.layers}, at.horizons, {blur}, {omega_i});",
-        *reached,
+        *reaching,
         f"  light /= {omega_i[2:]};",
         f"  float irradiance = light * normal.z * shown_area({omega_i}, at.center, at.spread);",
         f"  {hints} += float3(irradiance, normal.xy) / {number(count)};",

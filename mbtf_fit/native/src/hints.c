@@ -52,9 +52,8 @@ static void find(const mbtf_textures *t, float level, float u, float v, place *p
 
 /* Where a view ray meets the surface: rows that are read there. */
 typedef struct {
-    float z;
-    /* Whether a shadow ray reaches the light, and the weight of that. */
-    float lit, sharp;
+    /* Height, and share of the light that a shadow ray brings. */
+    float z, lit;
     place maps, horizons, fibers;
 } hit;
 
@@ -199,8 +198,8 @@ static void shade(const mbtf_surface *s, const hit *h, const float *i, const flo
     }
     const float nz = 1.0f / sqrtf(m[0] * m[0] + m[1] * m[1] + 1.0f);
     const matrix a = spread(m);
-    const float lower = h->sharp < 1.0f ? lower_horizons(s, &h->horizons, i) : 0.0f;
-    const float light = (lower + h->sharp * (h->lit - lower)) / i[2];
+    const float lower = lower_horizons(s, &h->horizons, i);
+    const float light = (s->light_depth > 0.0f ? 0.5f * (lower + h->lit) : lower) / i[2];
     const projection lit = project(i, m[0], m[1], a);
     const float irradiance = light * nz * shown(lit);
     float core[3];
@@ -303,13 +302,11 @@ static void meet(const mbtf_surface *s, const mbtf_queries *q, int64_t k, int p,
     h->z = mbtf_height(&s->heightfield, x, y, o, most);
     const float t = h->z / o[2], at = level + s->finer, hx = x + t * o[0], hy = y + t * o[1] / aspect;
     find(&s->maps, at, hx, hy, &h->maps);
-    h->sharp = s->shadow_rays ? clamped(1.0f + 0.5f * (at - top), 0.0f, 1.0f) : 0.0f;
-    if (h->sharp < 1.0f) find(&s->horizons, at, hx, hy, &h->horizons);
-    h->lit = 0.0f;
-    if (h->sharp > 0.0f) {
+    find(&s->horizons, at, hx, hy, &h->horizons);
+    if (s->light_depth > 0.0f) {
         const float *i = q->omega_i + 3 * k, down = h->z / i[2];
         const float first = mbtf_height(&s->heightfield, hx - down * i[0], hy - down * i[1] / aspect, i, most);
-        h->lit = first <= h->z + s->shadow_bias ? 1.0f : 0.0f;
+        h->lit = first > h->z ? expf((h->z - first) / (i[2] * s->light_depth)) : 1.0f;
     }
     if (s->fibers.levels) find(&s->fibers, level + s->fiber_finer, hx, hy, &h->fibers);
 }
@@ -336,7 +333,7 @@ EXPORT void mbtf_hints(const mbtf_surface *s, const mbtf_queries *q, float top, 
         if (ray >= rays) continue;
         meet(s, q, ray / places, (int)(ray % places), top, most, h);
         prefetch(&s->maps, &h->maps);
-        if (h->sharp < 1.0f) prefetch(&s->horizons, &h->horizons);
+        prefetch(&s->horizons, &h->horizons);
         if (s->fibers.levels) prefetch(&s->fibers, &h->fibers);
     }
 }

@@ -67,16 +67,15 @@ float mbtf_height(const mbtf_heightfield *f, float u, float v, const float *omeg
 /* What is known of a surface, see mbtf_fit/surface/known.py: heights, filtered maps and horizons, places of a
  * footprint (offsets x, y in sigma), levels by which lookups are finer there, RMS angle per axis of the light,
  * reflectances of the dielectric (along the normal, and grazing) and of the clear coat, constants of R6 and R8. Where
- * `fibers` has levels, bounds of the coverage, of cosines and of the variance (mbtf_fit/ops/fibers.py); whether shadow
- * rays are traced, and by how much what shadows a place is above it. */
+ * `fibers` has levels, bounds of the coverage, of cosines and of the variance (mbtf_fit/ops/fibers.py); depth of
+ * the light below the surface, 0 without shadow rays. */
 typedef struct {
     mbtf_heightfield heightfield;
     mbtf_textures maps, horizons, fibers;
     int32_t places;
     float offsets[2 * MAX_PLACES];
     float finer, light_width, light_blur, dielectric, edge, coat, least_view, albedo_spread[2], alpha2[2], voigt[2];
-    float fiber_finer, least_tangents, least_cosine, least_spread, shadow_bias;
-    int32_t shadow_rays;
+    float fiber_finer, least_tangents, least_cosine, least_spread, light_depth;
 } mbtf_surface;
 
 /* u (n, 2), sigma (n), omega_i and omega_o (n, 3), hints (n, HINTS) for relief, with fibers (n, HINTS + FIBER_HINTS). */
