@@ -57,8 +57,8 @@ class TracedHints:
         if self.known == "visibility":
             u, sigma, omega_i, omega_o = queries
             level = (-torch.log2(2.0 * sigma)).clamp(0.0, float(surface.lattice.finest))
-            _, hit = surface.intersections(trace, u, level, omega_o)
-            assumed = surface.visibility(shade, hit, level, omega_i).clamp_min(LEAST)
+            _, hit, depth = surface.intersections(trace, u, level, omega_o)
+            assumed = surface.visibility(shade, hit, depth, level, omega_i).clamp_min(LEAST)
             direct, reflection = (self._traced(known, queries).sum(1) for known in ("direct", "reflection"))
             hints[:, SCALED] *= (direct / reflection.clamp_min(LEAST))[:, None] / assumed
         elif self.known != "nothing":

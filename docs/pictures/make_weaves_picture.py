@@ -1,7 +1,7 @@
 """Make docs/pictures/weaves.jpg: the named weaves of docs/how-to/make-cloth.md, path-traced and fitted.
 
 Two commands make each fit: ``mbtf-gen material.yaml --quality draft --lights-per-path 4 -o shards`` and
-``mbtf-fit shards --quality draft --set network.relief.places=16``.
+``mbtf-fit shards --quality draft --set network.relief.places=16 --set network.relief.shadow_rays=true``.
 Finished folders are kept in out/weaves. Prints errors, and contrasts of the fits (luminance Y, R - Y, B - Y)
 over those of the references. From the repository's root, in an hour: ``.venv/bin/python
 docs/pictures/make_weaves_picture.py``.
@@ -45,7 +45,7 @@ TILES = 3
 # With fewer paths, the noise of the reference looks like fibers.
 PICTURE = f"--view 55,-90 --light 35,140 --tiles-across {TILES} --size 144 --spp 400".split()
 DRAFT = ("--quality", "draft")
-RAYS = ("--set", "network.relief.places=16")
+RAYS = ("--set", "network.relief.places=16", "--set", "network.relief.shadow_rays=true")
 QUERIES = {"u": 2, "sigma": 1, "omega_i": 3, "omega_o": 3}
 EXPOSURE = 1.65
 ACROSS = 2

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 FORMAT_NAME = "mbtf-material"
-SCHEMA_VERSION = 9
+SCHEMA_VERSION = 10
 DESCRIPTION_NAME = "material.json"
 WEIGHTS_NAME = "weights.safetensors"
 # Smallest cosine of the directions in data that do not state one.

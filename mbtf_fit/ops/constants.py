@@ -29,8 +29,8 @@ IRRADIANCE_SCALE, DEPTH_SCALE = 4.0, 10.0
 DIFFUSE_CHANNELS, GLOSSY_CHANNELS, COATED_CHANNELS = MAP_CHANNELS = 8, 10, 12
 # Azimuths of the horizons; share of the light kernel's width (RMS per axis) that blurs them.
 AZIMUTHS, LIGHT_BLUR = 16, 0.8
-# Distance in tile widths after which light below a surface is 1/e; between fibers it comes further. Of 0.0015
-# to 0.2, these explain most of the test values of rock and five cloths, by regression on the hints.
+# Distance in tile widths after which light below a surface is 1/e; between fibers, it goes deeper. Of 0.0015
+# to 0.2, these fit test values of two stones and four cloths best, by regression on the hints.
 LIGHT_DEPTH, CLOTH_LIGHT_DEPTH = 0.003, 0.04
 # Smallest cosines of light and view to a normal, bounds of a lobe's own α², least variance of horizons.
 LEAST_LIGHT, LEAST_VIEW, ALPHA2, LEAST_VARIANCE = 0.01, 0.05, (1e-6, 1.0), 1e-8

@@ -1,6 +1,6 @@
 """Operations: a model is an ordered list of them, which back ends implement by their types.
 
-An operation computes one or two named values from others. Every list starts from the values
+An operation computes one or more named values from others. Every list starts from the values
 
 - ``u`` (2): position, uv;
 - ``level`` (1): fractional level of the footprint, ``clamp(-log2(2σ), 0, k)``;

@@ -15,7 +15,6 @@ from mbtf_fit.ops.constants import (
     LEAST_VIEW,
     LIGHT_BLUR,
     LIGHT_DEPTH,
-    MAX_CROSSINGS,
 )
 from mbtf_fit.ops.operation import Operation, TensorName, TextureName, Value
 
@@ -35,10 +34,12 @@ class Shade(Operation):
 
         (R2) V = Φ((asin ω_i,z - h) / √max(v + (light_blur · light_width)², least_variance)).
 
-    With `heights`, V is the mean of that and of a second estimate. The light's ray to an intersection at the
-    height z first meets the heights at z', and is weakened from there,
+    With `heights`, V is the mean of that and of a shadow test. The ray from the light to an intersection at
+    the height z first meets the heights at z'. Below, its light falls off with the distance:
 
-        (R11) V' = exp(-(z' - z) / (ω_i,z light_depth)).
+        (R11) V' = exp(-(z' - z) / (ω_i,z light_depth)),
+
+    which is soft as edges of shadows are, or as fibers let light pass; the width of the light is that of R2.
 
     Facets whose slopes have the center c and the matrix A show to a direction ω, per area of the reference
     plane, the area (Heitz 2014)
@@ -92,8 +93,9 @@ class Shade(Operation):
     maps, horizons : textures by level
     light_width, dielectric : tensors (): RMS angle per axis of the light in radians; F0 of what is no metal
     finer : levels
-    depths, heights : heights of the intersections (1 each), and tensor (rows, columns, 1) that shadow rays
-        are traced to, as by :class:`~mbtf_fit.ops.lookup.Trace`; None for no shadow rays
+    depths, heights : heights of the intersections (1 per place), and tensor (rows, columns, 1) that shadow
+        rays are traced to, those of :class:`~mbtf_fit.ops.lookup.Trace`; None for no shadow rays
+    light_depth : tile widths, above 0
     """
 
     hits: Value
@@ -108,13 +110,18 @@ class Shade(Operation):
     depths: Value | None = None
     heights: TensorName | None = None
     light_depth: float = LIGHT_DEPTH
-    crossings: int = MAX_CROSSINGS
     light_blur: float = LIGHT_BLUR
     least_view: float = LEAST_VIEW
     least_variance: float = LEAST_VARIANCE
     alpha2: tuple[float, float] = ALPHA2
 
     def size(self, sizes: Sequence[int]) -> int:
+        if (self.depths is None) != (self.heights is None):
+            raise ValueError(f"shade '{self.output}' needs both depths and heights, or neither")
+        if self.depths is not None and 2 * sizes[4] != sizes[0]:
+            raise ValueError(f"shade '{self.output}' needs one depth per place")
+        if not self.light_depth > 0:
+            raise ValueError(f"shade '{self.output}' has light_depth {self.light_depth:g}, not above 0")
         return 6
 
 

@@ -214,7 +214,8 @@ class KnownSurface:
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Mean height (n, 1), uv (n, 2·places) and heights (n, places) of the intersections of the places'
         view rays; levels (n,)."""
-        sigma = 0.5 * torch.exp2(-level)[:, None]
+        # Far from the first tile, the rounding of uv would count as depth below the surface.
+        u, sigma = u - u.floor(), 0.5 * torch.exp2(-level)[:, None]
         aspect = u.new_tensor([1.0, self.lattice.aspect])
         heights, hits = [], []
         along = _azimuth(omega_o)
@@ -248,8 +249,8 @@ class KnownSurface:
         omega_o: Tensor,
         depths: Tensor | None = None,
     ) -> Tensor:
-        """Irradiance, normal (x, y) and core (RGB) (n, 6): means over the intersections (n, 2·places), whose
-        heights (n, places) shadow rays ask for."""
+        """Irradiance, normal (x, y) and core (RGB) (n, 6): means over the intersections (n, 2·places);
+        depths: their heights (n, places), which shadow rays need."""
         finer = level + shade.finer
         places = hits.split(2, 1)
         heights = [None] * len(places) if depths is None else depths.split(1, 1)
@@ -310,7 +311,7 @@ class KnownSurface:
         return torch.cat([irradiance, normal[:, :2], core], 1)
 
     def visibility(self, op: Shade, hit: Tensor, z: Tensor | None, level: Tensor, omega_i: Tensor) -> Tensor:
-        """Share (n, 1) of footprints at surface points from which the light is visible; z: their heights."""
+        """Visibility (n, 1) of the light; z (n, 1): heights of the points, None for horizons alone."""
         lower = self._lower_horizons(op, hit, level, omega_i)
         if op.heights is None or z is None:
             return lower

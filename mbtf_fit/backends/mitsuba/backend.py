@@ -61,7 +61,7 @@ class Loader:
 
         Raises
         ------
-        InputError : they are none
+        InputError : the tensor is empty, or has positive heights
         """
         known = self.heightfields
         if name not in known:

@@ -28,6 +28,7 @@ from mbtf_fit.ops.constants import (
     DIFFUSE_CHANNELS,
     GLOSSY_CHANNELS,
     MAP_CHANNELS,
+    MAX_CROSSINGS,
     VOIGT_SCALE,
     VOIGT_WIDENING,
 )
@@ -159,7 +160,7 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         omega_i: Vector3f,
         lit: DirectLight | None,
     ) -> list[Float]:
-        """(R11) Visibility of the light from each place: by shadow rays too on a plane."""
+        """Visibility of the light from each place: on a plane also by shadow rays (R11)."""
         towards = omega_i if lit is None else lit.towards(omega_i)
         lower = [lower_horizons(hit, level, towards, lit, k) for k, hit in enumerate(hits)]
         if op.heights is None or depths is None:
@@ -168,7 +169,7 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         aspect = loader.lattice.aspect
         tops = (displaced(hit, -z, omega_i, aspect) for hit, z in zip(hits, depths, strict=True))
         rays = [mi.Ray3f(on_top(top, aspect), -omega_i) for top in tops]
-        found = heights_below(loader.heightfield(op.heights), rays, op.crossings, flat)
+        found = heights_below(loader.heightfield(op.heights), rays, MAX_CROSSINGS, flat)
         rate = -dr.rcp(omega_i.z * op.light_depth)
         lit_by_ray = (dr.exp(rate * dr.maximum(top - z, 0.0)) for top, z in zip(found, depths, strict=True))
         return [dr.select(flat, 0.5 * (a + b), a) for a, b in zip(lower, lit_by_ray, strict=True)]

@@ -73,7 +73,9 @@ class Shell:
         return dr.fma(-(1.0 + _MARGIN), self.heightfield.bottom, 1e-6)
 
     def places(self, u: Sequence[Float], level: Float, omega_o: Sequence[Float]) -> Iterator[list[Float]]:
-        """uv of the places of a footprint."""
+        """uv of the places of a footprint, near the first tile: far from it, the rounding of uv would count
+        as depth below the surface."""
+        u = [c - dr.floor(c) for c in u]
         sigma = 0.5 * dr.exp2(-level)
         flat = mi.Vector2f(omega_o[0], omega_o[1])
         length = dr.sqrt(dr.fma(flat.x, flat.x, dr.square(flat.y)))

@@ -1,4 +1,4 @@
-"""View rays over a plane, traced to a periodic height field.
+"""Rays from above a plane, traced to a periodic height field.
 
 The quadtree of :mod:`mbtf_gen.tile.tracers.heightfield_tracer`, for rays from above on grids whose sides are
 powers of two. The state of a ray is its distance and the level of the next block: a third fewer instructions

@@ -9,7 +9,7 @@ from mbtf_core.data.schema import CLEARCOAT_F0
 from mbtf_fit import ops
 from mbtf_fit.backends.shader.backend import SHADER, Code, Value, in_fours
 from mbtf_fit.backends.shader.syntax import number, vector
-from mbtf_fit.ops.constants import COATED_CHANNELS, GLOSSY_CHANNELS
+from mbtf_fit.ops.constants import COATED_CHANNELS, GLOSSY_CHANNELS, MAX_CROSSINGS
 from mbtf_fit.ops.shade import grazing_reflectance
 
 PER_WIDTH = "float2(1.0, ASPECT)"
@@ -142,7 +142,7 @@ def _shade(
         points = code.variable("float3", "points", count, kept=False)
         uv_and_z = (f"float3({hits[2 * k : 2 * k + 2]}, {depths[k : k + 1]})" for k in range(count))
         code.write(*(f"{points}[{k}] = {point};" for k, point in enumerate(uv_and_z)))
-        ray = f"{_nodes(code, op.heights)}, {op.crossings}, {points}[k], {number(op.light_depth)}, {omega_i}"
+        ray = f"{_nodes(code, op.heights)}, {MAX_CROSSINGS}, {points}[k], {number(op.light_depth)}, {omega_i}"
         reaching = [f"  light = 0.5 * (light + reaching({ray}));"]
     code.write(
         f"{hints} = float3(0.0, 0.0, 0.0);",

@@ -52,7 +52,7 @@ static void find(const mbtf_textures *t, float level, float u, float v, place *p
 
 /* Where a view ray meets the surface: rows that are read there. */
 typedef struct {
-    /* Height, and share of the light that a shadow ray brings. */
+    /* Height; visibility by the shadow ray, where one is traced. */
     float z, lit;
     place maps, horizons, fibers;
 } hit;
@@ -298,7 +298,9 @@ static void meet(const mbtf_surface *s, const mbtf_queries *q, int64_t k, int p,
     const float length = sqrtf(o[0] * o[0] + o[1] * o[1]);
     const float ax = length > 0.0f ? o[0] / length : 1.0f, ay = length > 0.0f ? o[1] / length : 0.0f;
     const float across = sigma * s->offsets[2 * p], along = sigma * s->offsets[2 * p + 1];
-    const float x = u[0] + along * ax - across * ay, y = u[1] + (along * ay + across * ax) / aspect;
+    /* Far from the first tile, the rounding of uv would count as depth below the surface. */
+    const float x = u[0] - floorf(u[0]) + along * ax - across * ay;
+    const float y = u[1] - floorf(u[1]) + (along * ay + across * ax) / aspect;
     h->z = mbtf_height(&s->heightfield, x, y, o, most);
     const float t = h->z / o[2], at = level + s->finer, hx = x + t * o[0], hy = y + t * o[1] / aspect;
     find(&s->maps, at, hx, hy, &h->maps);

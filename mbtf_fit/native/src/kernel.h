@@ -67,8 +67,8 @@ float mbtf_height(const mbtf_heightfield *f, float u, float v, const float *omeg
 /* What is known of a surface, see mbtf_fit/surface/known.py: heights, filtered maps and horizons, places of a
  * footprint (offsets x, y in sigma), levels by which lookups are finer there, RMS angle per axis of the light,
  * reflectances of the dielectric (along the normal, and grazing) and of the clear coat, constants of R6 and R8. Where
- * `fibers` has levels, bounds of the coverage, of cosines and of the variance (mbtf_fit/ops/fibers.py); depth of
- * the light below the surface, 0 without shadow rays. */
+ * `fibers` has levels, bounds of the coverage, of cosines and of the variance (mbtf_fit/ops/fibers.py). `light_depth`
+ * is 0 without shadow rays. */
 typedef struct {
     mbtf_heightfield heightfield;
     mbtf_textures maps, horizons, fibers;

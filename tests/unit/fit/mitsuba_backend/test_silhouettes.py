@@ -309,8 +309,9 @@ def test_samples_are_those_of_value_and_density(sampling: str, tmp_path: Path) -
 
 
 def test_a_plane_looks_as_without_silhouettes(tmp_path: Path) -> None:
-    """Holes from both sides."""
-    write_material(tmp_path, model="relief", finest=3, transmittance=holes(0.1))
+    """Holes from both sides; rays to the light."""
+    relief = {"relief": {"places": 4, "shadow_rays": True}}
+    write_material(tmp_path, model="relief", network=relief, finest=3, transmittance=holes(0.1))
     found, passed = [], []
     for silhouettes in (False, True):
         bsdf = {"type": "mbtf", "material": str(tmp_path), "silhouettes": silhouettes}

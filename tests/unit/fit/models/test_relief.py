@@ -20,6 +20,8 @@ from mbtf_core.errors import InputError
 from mbtf_fit.backends.cpu.pattern import match
 from mbtf_fit.config import build_model
 from mbtf_fit.material.inference import predict
+from mbtf_fit.ops import Shade
+from mbtf_fit.ops.operation import sizes_of
 from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.pytorch.operations import rotate_to_z
 
@@ -36,7 +38,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no hints": {"relief": {"hints": False}},
     "wide": {"width": 31, "channels": 11, "layers": 3, "encoding": {"direction_xyz": False}},
     "shadow rays": {"relief": {"places": 2, "shadow_rays": True}},
-    "cloth": {"relief": {"places": 2}},
+    "cloth": {"relief": {"places": 2, "shadow_rays": True}},
     "cloth without frame": {"relief": {"frame": False, "gate": False}},
 }
 
@@ -131,3 +133,31 @@ def test_the_kernel_does_not_take_inputs_with_a_bound(name: str) -> None:
     operations = model_of("cloth").operations
     assert match(operations) is not None
     assert match([replace(op, most="most") if op.output == name else op for op in operations]) is None
+
+
+def shade_of(model: NeuralMaterial) -> Shade:
+    assert model.tracing is not None
+    return model.tracing[1]
+
+
+def test_light_comes_further_between_fibers() -> None:
+    cloth, stone = (shade_of(model_of(name)).light_depth for name in ("cloth", "shadow rays"))
+    assert cloth > 5 * stone
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"heights": None}, "needs both depths and heights"),
+        ({"depths": "z"}, "needs one depth per place"),
+        ({"light_depth": 0.0}, "has light_depth 0, not above 0"),
+    ],
+)
+def test_shadow_rays_ask_for_depths_and_heights(change: dict[str, Any], message: str) -> None:
+    operations = model_of("shadow rays").operations
+    changed = [replace(op, **change) if isinstance(op, Shade) else op for op in operations]
+    with pytest.raises(ValueError, match=message):
+        sizes_of(changed)
+    assert match(operations) is not None
+    other = [replace(op, heights="other") if isinstance(op, Shade) else op for op in operations]
+    assert match(other) is None

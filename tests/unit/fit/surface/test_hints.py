@@ -308,6 +308,15 @@ def test_light_in_a_groove_weakens_below_the_ray_past_its_ridge(azimuth: float, 
     assert 15 < (wanted == 1.0).sum() < 25
 
 
+def test_far_tiles_look_like_the_first_one(compiled: bool) -> None:
+    """Also where rays to the light magnify the rounding of positions, which are exact here."""
+    known = rough_surface(LATTICE)
+    u, sigma, light, view = queries(1000)
+    u = (1024 * u).round() / 1024
+    near, far = (hints_of(known, u + n, sigma, light, view, places=4, light_depth=0.003) for n in (0, 512))
+    torch.testing.assert_close(near, far, atol=0, rtol=0)
+
+
 @pytest.mark.parametrize("level", [2.0, 4.0])
 def test_visibility_is_that_of_shadow_rays(level: float) -> None:
     """Shares of Gaussian footprints that see the light: by many shadow rays, and by the filtered horizon."""
