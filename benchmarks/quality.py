@@ -15,6 +15,7 @@ import shutil
 import subprocess
 import sys
 import time
+import zlib
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -24,7 +25,8 @@ from common import HEIGHT_SCALES, finish, is_available, kept, parser_of, source,
 
 from mbtf_core.app.options import Quality
 from mbtf_core.config.settings import resolve
-from mbtf_core.units import clock
+from mbtf_core.units import clock, parse_duration
+from mbtf_fit.config import FITTER, best_options
 from mbtf_gen.config.generator import GENERATOR, RESOLUTION, GeneratorConfig
 
 # Texture sets of the longer runs.
@@ -131,6 +133,13 @@ def requested(only: Sequence[str] | None) -> list[tuple[str, Quality]]:
     return out
 
 
+def options_of(quality: Quality) -> str:
+    """Checksum of what a preset stands for: figures of an earlier one are not kept."""
+    training = FITTER[quality]
+    sizes = best_options(parse_duration(training.get("training.time", "1h")))
+    return f"{zlib.crc32(json.dumps([GENERATOR[quality], training, sizes]).encode()):08x}"
+
+
 def main() -> int:
     parser = parser_of(__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder of the finished runs")
@@ -142,7 +151,7 @@ def main() -> int:
     for name, quality in requested(arguments.only):
         if is_available(name):
             resolution = int(arguments.resolution or GENERATOR[quality][RESOLUTION])
-            path = arguments.out / f"{name}-{quality}-{resolution}.json"
+            path = arguments.out / f"{name}-{quality}-{resolution}-{options_of(quality)}.json"
             runs.append(kept(path, partial(run, name, quality, resolution, arguments.out / ".work")))
             print(row_of(runs[-1]), flush=True)
     timed = [r for r in runs if r["quality"] in THRESHOLDS and arguments.resolution is None]
