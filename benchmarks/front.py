@@ -43,6 +43,7 @@ from quality import generator_config
 
 from mbtf_core.config.settings import deep_merge, resolve
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.stats import Estimate, ratio_of
 from mbtf_core.units import parse_duration
 from mbtf_fit import FitConfig, fit
 from mbtf_gen.generation.run import generate
@@ -180,10 +181,10 @@ def train(
     return found
 
 
-def ratio_of(a: dict[str, Any], b: dict[str, Any]) -> tuple[float, float]:
+def over(a: dict[str, Any], b: dict[str, Any]) -> tuple[float, float]:
     """Error of a fit over that of another, and its standard error."""
-    ratio = a["value"] / b["value"]
-    return ratio, ratio * math.hypot(a["error"] / a["value"], b["error"] / b["value"])
+    ratio = ratio_of(*(Estimate(one["value"], one["error"], len(one["seeds"])) for one in (a, b)))
+    return ratio.value, ratio.error
 
 
 def compared(name: str, folder: Path, steps: dict[str, int], seeds: int) -> dict[str, Any]:
@@ -196,7 +197,7 @@ def compared(name: str, folder: Path, steps: dict[str, int], seeds: int) -> dict
         }
 
     fits = fits_of(CLOTH_MODELS if name in CLOTHS else MODELS)
-    ratio, error = ratio_of(fits["relief"], fits["neumip"])
+    ratio, error = over(fits["relief"], fits["neumip"])
     extent = Dataset.open(data).manifest["tile"]["displacement_range"]
     limit = THRESHOLDS["displaced" if extent >= DISPLACED else "any"]
     found = {"material": name, "displacement_range": extent, "fits": fits, "ratio": ratio, "error": error}
@@ -204,12 +205,12 @@ def compared(name: str, folder: Path, steps: dict[str, int], seeds: int) -> dict
     published, _ = first_known(sources, lambda p: p.mse_ratio(name, "neumip", "neumip-baseline"))
     if published is not None:
         plain = fits_of(BASELINE)["neumip-baseline"]
-        ratios = {label: ratio_of(one, plain) for label, one in fits.items()}
+        ratios = {label: over(one, plain) for label, one in fits.items()}
         found["over_baseline"] = {"published neumip": published, "ratios": ratios}
         texts = "   ".join(f"{label} {value:.2f} ± {bar:.2f}" for label, (value, bar) in ratios.items())
         print(f"{name:16s} over neumip-baseline: {texts}   published for neumip {published:.2f}")
     for label in list(MODELS)[1:]:
-        value, bar = ratio_of(fits[label], fits["neumip"])
+        value, bar = over(fits[label], fits["neumip"])
         print(f"{name:16s} {label} over neumip {value:.2f} ± {bar:.2f}", flush=True)
     return {**found, "met": ratio - STANDARD_ERRORS * error <= limit}
 
