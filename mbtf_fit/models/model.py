@@ -23,7 +23,7 @@ SPECIAL = (
     *("network.channels", "network.width", "network.layers", "network.decoder", "network.activation"),
     *("network.output_channels", "network.output_transform", "network.offset", "network.oversampling"),
     "network.encoding",
-    *(f"network.relief.{name}" for name in ("places", "hints", "frame", "gate")),
+    *(f"network.relief.{name}" for name in ("places", "shadow_rays", "hints", "frame", "gate")),
     *("decoder", "training.shared_decoder", "training.materials", "training.own_material"),
     "training.residual_levels",
 )

@@ -105,6 +105,7 @@ def test_unset_options_are_the_models_own() -> None:
     [
         (["model=neumip-baseline", "network.offset=depth"], "has no option network.offset"),
         (["model=neumip+", "network.relief.places=4"], "has no option network.relief.places"),
+        (["model=neumip+", "network.relief.shadow_rays=true"], "has no option network.relief.shadow_rays"),
         (["network.decoder=inception"], "has no option network.decoder, which hierarchical has"),
     ],
 )
