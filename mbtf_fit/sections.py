@@ -50,7 +50,7 @@ class ReliefSection(Settings):
         1, description="view rays that are traced per query, spread over its footprint"
     )
     shadow_rays: bool = Field(
-        False, description="also trace a ray to the light from each point where a view ray meets the surface"
+        False, description="also trace a ray to the light from where each view ray ends"
     )
     hints: bool = Field(
         True, description="irradiance, normal and single scattering of the known surface as inputs"

@@ -21,8 +21,9 @@ from mbtf_fit.native import library
 from mbtf_fit.ops.constants import PLACES
 from mbtf_fit.surface import hints
 from mbtf_fit.surface.hints import compute_hints
-from mbtf_fit.surface.known import KnownSurface, lookup_sigma, prefilter
+from mbtf_fit.surface.known import KnownSurface
 from mbtf_fit.surface.lookup import Packing, lookup
+from mbtf_fit.surface.prefilter import lookup_sigma, prefilter
 from mbtf_gen.render.bsdf.surface import SurfaceParts
 from mbtf_gen.sampling.light_kernel import LightKernel
 
