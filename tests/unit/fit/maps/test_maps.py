@@ -114,7 +114,7 @@ def test_levels_that_are_missing_are_refused(tmp_path: Path) -> None:
     material = write_material(tmp_path / "relief", model="relief")
     assert knows_surface(material)
     # A surface that a model traces and does not shade has colors that are not the model's.
-    traced = ops.Trace("z", "hit", "u", "level", "omega_o", HEIGHTS)
+    traced = ops.Trace("z", "hit", "depth", "u", "level", "omega_o", HEIGHTS)
     model = NeuralMaterial(Lattice(3, 1.0), [traced, ops.Lookup("value", "hit", "level", "texels", 3)])
     assert not knows_surface(replace(material, model=model))
     assert make_maps(material, None, Console(quiet=True))[0].level == 3
