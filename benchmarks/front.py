@@ -7,10 +7,11 @@
 For each material, all models are trained on the same data, 128 texels across, 400 queries of 4 paths per
 texel, of five assets and six texture sets. Test queries have 256 paths, and three quarters of them are drawn
 by the highlights. All networks have the same width; ``relief`` traces one, two, four or sixteen view rays per
-footprint; on cloth, measured where it is named, ``cloth`` takes its place. On the materials of Kuznetsov et
-al. 2021, ``neumip-baseline`` is trained as well. ``--ablation`` leaves out one part of a model at a time, on
-one material (``rock_cliff`` by default). ``--rock-cliff`` is the benchmark ``rock_cliff-128``: models of
-default sizes, a larger ``neumip`` and the baseline, on the data of ``pipelines/rock_cliff.yaml``.
+footprint, sixteen also with shadow rays; on cloth, measured where it is named, ``cloth`` takes its place. On
+the materials of Kuznetsov et al. 2021, ``neumip-baseline`` is trained as well. ``--ablation`` leaves out one
+part of a model at a time, on one material (``rock_cliff`` by default). ``--rock-cliff`` is the benchmark
+``rock_cliff-128``: models of default sizes, a larger ``neumip`` and the baseline, on the data of
+``pipelines/rock_cliff.yaml``.
 
 Training rates are measured first, in turns; nothing else should use the processors then. Fits get the steps
 that the time allows at these rates. FOLDER keeps data, rates and errors, so the same command resumes.
@@ -95,7 +96,7 @@ MODELS: dict[str, dict[str, Any]] = {
     "relief": RELIEF,
     **{
         rays: deep_merge(RELIEF, {"network": PARTS["relief"][rays]})
-        for rays in ("two rays", "four rays", "sixteen rays")
+        for rays in ("two rays", "four rays", "sixteen rays", "sixteen rays, shadow rays")
     },
 }
 # On cloth, by the same labels.

@@ -35,7 +35,8 @@ CASES: dict[str, dict[str, Any]] = {
     },
     "relief": {"model": "relief"},
     "relief, diffuse, four places": {"model": "relief", "glossy": False, **net(relief={"places": 4})},
-    "relief under a coat": {
+    "relief under a coat": {"model": "relief", "coated": True, **net(relief={"places": 2})},
+    "shadow rays under a coat": {
         "model": "relief",
         "coated": True,
         **net(relief={"places": 2, "shadow_rays": True}),

@@ -63,10 +63,6 @@ class DirectLight:
     depth: Float
     heights: Sequence[Float]
 
-    def towards(self, omega_i: Vector3f) -> Vector3f:
-        """Towards the light, given the direction of the plane's data."""
-        return dr.select(self.flat, omega_i, self.omega_i)
-
     @property
     def bend(self) -> Float:
         """Curvature along the light's azimuth."""
@@ -158,10 +154,10 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         depths: Numbers | None,
         level: Float,
         omega_i: Vector3f,
+        towards: Vector3f,
         lit: DirectLight | None,
     ) -> list[Float]:
         """Visibility of the light from each place: on a plane also by shadow rays (R11)."""
-        towards = omega_i if lit is None else lit.towards(omega_i)
         lower = [lower_horizons(hit, level, towards, lit, k) for k, hit in enumerate(hits)]
         if op.heights is None or depths is None:
             return lower
@@ -178,6 +174,7 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         found: Numbers,
         seen: Float,
         omega_i: Vector3f,
+        towards: Vector3f,
         omega_o: Vector3f,
         frame: Frame | None,
         lit: DirectLight | None,
@@ -186,7 +183,6 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
         x, y, *moments = found[:5]
         center, spread, base = mi.Vector2f(x, y), _spread(x, y, *moments), mi.Color3f(*found[5:8])
         upright = dr.rsqrt(1.0 + dr.squared_norm(center))
-        towards = omega_i if lit is None else lit.towards(omega_i)
         light = seen / omega_i.z
         facing = light * _shown(towards, center, spread)
         hints = [upright * facing, -upright * x, -upright * y]
@@ -244,11 +240,12 @@ def _shade(op: ops.Shade, loader: Loader) -> Step:
     ) -> Numbers:
         places = [mi.Point2f(*hits[k : k + 2]) for k in range(0, len(hits), 2)]
         finer, light, view = level[0] + op.finer, mi.Vector3f(*omega_i), mi.Vector3f(*omega_o)
-        seen = visibilities(places, depths, finer, light, lit)
+        towards = light if lit is None else dr.select(lit.flat, light, lit.omega_i)
+        seen = visibilities(places, depths, finer, light, towards, lit)
         read = [maps.blended(hit, finer) for hit in places]
         # A basic block of its own: four places in one spill registers, which takes 5% of the kernel's time.
         dr.detail.new_scope(dr.backend_v(mi.Float))
-        shared = (light, view, frame, lit)
+        shared = (light, towards, view, frame, lit)
         parts = [at(read[k], seen[k], *shared, k) for k in range(len(places))]
         return [sum(column) / len(parts) for column in zip(*parts, strict=True)]
 

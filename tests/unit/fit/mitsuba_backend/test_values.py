@@ -67,7 +67,7 @@ def test_conformance_and_random_queries(name: str, tmp_path: Path) -> None:
     queries["sigma"] *= np.float32(1.5)
     found, wanted = plugin.evaluate(*queries.values()), material.evaluate(*queries.values())
     # Light that passes below a surface weakens within 0.003, which magnifies the rounding of heights.
-    assert deviation(found, wanted) < (1e-3 if name == "relief under a coat" else 1e-4)
+    assert deviation(found, wanted) < (1e-3 if name == "shadow rays under a coat" else 1e-4)
 
 
 @pytest.mark.parametrize(
