@@ -44,6 +44,7 @@ from quality import generator_config
 
 from mbtf_core.config.settings import deep_merge, resolve
 from mbtf_core.data.dataset import Dataset
+from mbtf_core.files.atomic import read_json
 from mbtf_core.stats import Estimate, ratio_of
 from mbtf_core.units import parse_duration
 from mbtf_fit import FitConfig, fit
@@ -143,7 +144,10 @@ def steps_of(models: dict[str, dict[str, Any]], data: Path, folder: Path, time: 
                 found[label].append(record["queries_per_second"])
         return {"processor": processor(), "rates": {label: median(each) for label, each in found.items()}}
 
-    measured = kept(folder / "rates.json", rates)
+    path = folder / "rates.json"
+    if path.exists() and not models.keys() <= read_json(path)["rates"].keys():
+        path.unlink()  # of another list of models
+    measured = kept(path, rates)
     print(f"queries per second, {measured['processor']}: {measured['rates']}")
     return {label: round(seconds * rate / batch) for label, rate in measured["rates"].items()}
 

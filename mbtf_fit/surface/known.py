@@ -224,10 +224,14 @@ class KnownSurface:
         for x, y in trace.places:
             at = u + sigma * (x * across + y * along) / aspect
             z = self.tracer.trace(at, omega_o)[:, None]
-            hits.append(at + z / omega_o[:, 2:] * omega_o[:, :2] / aspect)
+            hits.append(self._displaced(at, z, omega_o))
             heights.append(z)
         depths = torch.cat(heights, 1)
         return depths.mean(1, keepdim=True), torch.cat(hits, 1), depths
+
+    def _displaced(self, u: Tensor, z: Tensor, omega: Tensor) -> Tensor:
+        """uv (n, 2) of a ray through `u` at the height 0 where its height is z (n, 1)."""
+        return u + z / omega[:, 2:] * omega[:, :2] / u.new_tensor([1.0, self.lattice.aspect])
 
     def read_maps(self, hit: Tensor, level: Tensor) -> Tensor:
         """All numbers of the maps (n, channels) at surface points (n, 2); levels (n,)."""
@@ -317,8 +321,7 @@ class KnownSurface:
         if op.heights is None or z is None:
             return lower
         # (R11)
-        start = hit - z / omega_i[:, 2:] * omega_i[:, :2] / hit.new_tensor([1.0, self.lattice.aspect])
-        first = self.tracer.trace(start, omega_i)[:, None]
+        first = self.tracer.trace(self._displaced(hit, -z, omega_i), omega_i)[:, None]
         below = (first - z).clamp_min(0.0) / omega_i[:, 2:]
         return 0.5 * (lower + torch.exp(-below / op.light_depth))
 
