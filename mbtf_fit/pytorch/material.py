@@ -237,6 +237,13 @@ class NeuralMaterial(nn.Module):
         return None if trace is None or shade is None else (trace, shade)
 
     @property
+    def rays(self) -> int:
+        """Rays that are traced for one value."""
+        places = sum(len(op.places) for op in self._own if isinstance(op, ops.Trace))
+        shadows = any(isinstance(op, ops.Shade) and op.heights is not None for op in self._own)
+        return places * (1 + shadows)
+
+    @property
     def fiber_frame(self) -> ops.FiberFrame | None:
         """The operation that reads the fibers of the surface, if there is one."""
         return next((op for op in self._own if isinstance(op, ops.FiberFrame)), None)

@@ -9,12 +9,12 @@ each linear between knots of the cosine and between levels. The mean over the ti
 one elevation, is equal at all levels: that of the data. With hat functions φ_j about the knots, of the
 light's elevation for G_i and of the view's for G_o, each table is the solution, level by level, of
 
-    E[φ_j M'_s] = E[φ_j t] = E[φ_j (t - M_0)] + E[φ_j M_0].
+    E[φ_j M'_s] = E[φ_j t] = E[φ_j (t - M)] + E[φ_j M].
 
 t is a query's noisy value; the equations are linear in it, so that the noise averages out. The first term is
-a mean over training queries, the others are means over low-discrepancy points, over which level 0 is smooth.
-The variance of both is known, and the equations are solved with a prior of smooth factors near 1, so that
-data with large variance change the factors little.
+a mean over training queries, the others are means over low-discrepancy points, the last one with footprints
+of the training queries. The variance of both is known, and the equations are solved with a prior of smooth
+factors near 1, so that data with large variance change the factors little.
 """
 
 from __future__ import annotations
@@ -39,8 +39,6 @@ MAX_QUERIES = 1 << 21
 _CHUNK = 1 << 18
 # Evaluations that are always granted.
 _LEAST_EVALUATIONS = 1 << 19
-# Footprint of level 0.
-_COARSEST = np.float32(0.5)
 # Points per level, at most: their means at level 0 are within POINT_ERROR (measured: 3.6e-4); fewer where
 # queries are few.
 POINTS = 1 << 18
@@ -125,6 +123,7 @@ def fit_calibration(
     bound: Callable[[Tensor], Tensor | None],
     evaluations: int | None = None,
     progress: Callable[[float], None] = lambda fraction: None,
+    most_points: int = POINTS,
 ) -> F32:
     """Tables (2, levels, knots, 3) of G_i and G_o.
 
@@ -136,11 +135,13 @@ def fit_calibration(
     bound : Huber bound of the errors of predictions (n, 3); None without one
     evaluations : about the most that it may take; no limit by default
     progress : called with the fraction that is done, after each block
+    most_points : points per level, at most
     """
     levels = lattice.finest + 1
-    used = most_queries(len(queries), levels, evaluations)
-    # Two evaluations of each query, one of each point and level.
-    work = 2 * used + levels * _points_of(used)
+    used = most_queries(len(queries), levels, most_points, evaluations)
+    total = _points_of(used, most_points)
+    # Points are evaluated at each level, and at the footprints of queries.
+    work = used + (levels + 1) * total
     done = 0
 
     def count(n: int) -> None:
@@ -151,6 +152,7 @@ def fit_calibration(
     progress(0.0)
     sums, squares = np.zeros((2, _BINS, 3)), np.zeros((2, _BINS, 3))
     largest = 0.0
+    sigmas: list[F32] = []
     for start in range(0, used, _CHUNK):
         part = queries.slice(start, min(start + _CHUNK, used))
         u, sigma, *directions = (a.cpu().numpy() for a in (part.u, part.sigma, part.omega_i, part.omega_o))
@@ -160,38 +162,39 @@ def fit_calibration(
         most = bound(part.value.new_tensor(own))
         if most is not None:
             residual = residual.clip(-most.cpu().numpy(), most.cpu().numpy())
-        residual = residual + (own - evaluate(u, np.full_like(sigma, _COARSEST), *directions))
         for k, omega in enumerate(directions):
             sums[k] += _binned(_bin(omega), residual)
             squares[k] += _binned(_bin(omega), residual.astype(np.float64) ** 2)
             largest = max(largest, float(np.hypot(omega[:, 0], omega[:, 1]).max()))
-        count(2 * len(u))
-    means, spread, kept = _means(evaluate, lattice, held_out, min(largest, 1.0), _points_of(used), count)
+        sigmas.append(sigma)
+        count(len(u))
+    footprints = np.resize(np.concatenate(sigmas), total)
+    means, spread, kept = _means(evaluate, lattice, held_out, min(largest, 1.0), footprints, count)
     tables = np.ones((2, levels, KNOTS, 3))
     for s in range(levels):
         for c, k in product(range(3), (0, 1) * ROUNDS):
             # Sums over the other elevation, with its current factors.
             other = _HATS @ tables[1 - k, s, :, c]
-            mine = means[s, ..., c] @ other if k == 0 else other @ means[s, ..., c]
-            total = sums[k, :, c] / used + means[0, ..., c].sum(1 - k)
-            variance = squares[k, :, c] / used**2 + spread[s, ..., c].sum(1 - k) / kept
-            target = _HATS.T @ total
+            mine = means[1 + s, ..., c] @ other if k == 0 else other @ means[1 + s, ..., c]
+            wanted = sums[k, :, c] / used + means[0, ..., c].sum(1 - k)
+            variance = squares[k, :, c] / used**2 + spread[1 + s, ..., c].sum(1 - k) / kept
+            target = _HATS.T @ wanted
             covariance = _HATS.T @ (variance[:, None] * _HATS) + np.diag((POINT_ERROR * target) ** 2)
             tables[k, s, :, c] = solve(_HATS.T @ (mine[:, None] * _HATS), target, covariance)
     return tables.astype(np.float32)
 
 
-def most_queries(queries: int, levels: int, evaluations: int | None = None) -> int:
+def most_queries(queries: int, levels: int, most_points: int, evaluations: int | None = None) -> int:
     """How many of the training queries are used, within so many evaluations of them and of the points."""
     if evaluations is not None:
         granted = max(evaluations, _LEAST_EVALUATIONS)
         # Points are twice as many as queries, up to a limit.
-        queries = min(queries, max(granted // (2 + 2 * levels), (granted - levels * POINTS) // 2))
+        queries = min(queries, max(granted // (3 + 2 * levels), granted - (levels + 1) * most_points))
     return min(queries, MAX_QUERIES)
 
 
-def _points_of(queries: int) -> int:
-    return min(POINTS, max(_LEAST_POINTS, 2 * queries))
+def _points_of(queries: int, most: int) -> int:
+    return min(most, max(_LEAST_POINTS, 2 * queries))
 
 
 def _means(
@@ -199,22 +202,24 @@ def _means(
     lattice: Lattice,
     held_out: HeldOutSection,
     largest: float,
-    total: int,
+    sigmas: F32,
     count: Callable[[int], None],
 ) -> tuple[F64, F64, int]:
-    """Means over points of a fit's values at each level, and of their squared differences from level 0, by
-    bins of light and view: (levels, bins, bins, 3) each; and the number of points."""
-    out = np.zeros((2, lattice.finest + 1, _BINS * _BINS, 3))
+    """Means over points of a fit's values with footprints of queries (points,), then at each level, and of
+    their squared differences from the first, by bins of light and view: (1 + levels, bins, bins, 3) each; and
+    the number of points."""
+    out = np.zeros((2, lattice.finest + 2, _BINS * _BINS, 3))
     used = 0
-    for start in range(0, total, _CHUNK):
-        stop = min(start + _CHUNK, total)
+    for start in range(0, len(sigmas), _CHUNK):
+        stop = min(start + _CHUNK, len(sigmas))
         u, light, view = points(start, stop, largest)
         kept = ~(in_region(held_out, light) | in_region(held_out, view))
         u, light, view = u[kept], light[kept], view[kept]
         used += len(u)
         index, first = _bin(light) * _BINS + _bin(view), np.zeros((0, 3), np.float32)
-        for s in range(lattice.finest + 1):
-            value = evaluate(u, np.full(len(u), sigma_of_level(s), np.float32), light, view)
+        each = (np.full(len(u), sigma_of_level(s), np.float32) for s in range(lattice.finest + 1))
+        for s, sigma in enumerate((sigmas[start:stop][kept], *each)):
+            value = evaluate(u, sigma, light, view)
             count(stop - start)
             first = value if s == 0 else first
             out[0, s] += _binned(index, value, _BINS * _BINS)

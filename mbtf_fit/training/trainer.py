@@ -33,7 +33,7 @@ from mbtf_fit.ops import Lookup
 from mbtf_fit.pytorch.material import NeuralMaterial
 from mbtf_fit.pytorch.textures import annealed_sigma
 from mbtf_fit.sections import TrainingSection
-from mbtf_fit.training.calibration import fit_calibration
+from mbtf_fit.training.calibration import POINTS, fit_calibration
 from mbtf_fit.training.suitable_data import open_data
 
 TrainingData = TrainingQueries | TrainingImages | TrainingSlices | SharedSlices | StreamedQueries
@@ -44,6 +44,8 @@ BETAS = (0.8, 0.95)
 WIDEST_BLUR = 0.125
 # Difference of fractional levels that rounding explains.
 _SAME_LEVEL = 1e-4
+# Rays per value from which on fewer points are used for the calibration.
+_RAYS = 8
 # Largest share of the budget that the warm-up takes.
 _WARMUP_SHARE = 0.2
 # Noise-to-signal ratio below which the decay of weights falls quadratically, so that few but clean queries
@@ -286,8 +288,8 @@ class Trainer:
 
     def calibrate(self, steps: int, progress: Callable[[float], None] = lambda fraction: None) -> None:
         """Fit the calibration factors (:mod:`~mbtf_fit.training.calibration`), if it :attr:`calibrates`; with
-        at most a quarter as many evaluations as the queries of its `steps`: with the hints of `relief`, an
-        evaluation takes as long as two of these. `progress` is called with the fraction that is done."""
+        at most a quarter as many evaluations as the queries of its `steps`, and at fewer points where many
+        rays are traced for each. `progress` is called with the fraction that is done."""
         model = self.model
         if not self.calibrates:
             return
@@ -302,6 +304,7 @@ class Trainer:
             self.loss.bound,
             steps * self.batch // 4,
             progress,
+            POINTS // max(1, model.rays // _RAYS),
         )
         model.calibrate(torch.from_numpy(found).to(self.device))
 
