@@ -16,7 +16,7 @@ from mbtf_fit.material.inference import predict
 from mbtf_fit.ops.constants import KNOTS
 from mbtf_fit.pytorch.operations import interpolate_factors
 from mbtf_fit.sections import HeldOutSection
-from mbtf_fit.training.calibration import fit_calibration
+from mbtf_fit.training.calibration import POINTS, fit_calibration
 
 F32 = np.ndarray
 LATTICE = Lattice(3)
@@ -96,6 +96,23 @@ def test_outliers_do_not_dominate() -> None:
     queries.value[::2500] = 1e6
     found = fit_calibration(wrong, LATTICE, queries, HELD_OUT, lambda p: 2.0 + 0 * p)
     np.testing.assert_allclose(found, kept, atol=0.02)
+
+
+def test_evaluations_are_bounded() -> None:
+    """Those of queries and points together; fewer points leave more queries."""
+    evaluated = 0
+
+    def counted(u: F32, *rest: F32) -> F32:
+        nonlocal evaluated
+        evaluated += len(u)
+        return truth(u, *rest)
+
+    queries = data(150_000, 0.5)
+    # Points in the held-out region are not evaluated.
+    for points, least, most in ((POINTS, 1 << 18, 1 << 19), (4096, len(queries), len(queries) + 5 * 4096)):
+        evaluated = 0
+        fit_calibration(counted, LATTICE, queries, HELD_OUT, nothing, 1 << 19, most_points=points)
+        assert least < evaluated <= most
 
 
 def test_fits_are_calibrated_by_default(tmp_path: Path) -> None:
