@@ -239,9 +239,9 @@ class NeuralMaterial(nn.Module):
     @property
     def rays(self) -> int:
         """Rays that are traced for one value."""
-        places = sum(len(op.places) for op in self._own if isinstance(op, ops.Trace))
-        shadows = any(isinstance(op, ops.Shade) and op.heights is not None for op in self._own)
-        return places * (1 + shadows)
+        if self.tracing is None:
+            return 0
+        return len(self.tracing[0].places) * (1 if self.tracing[1].heights is None else 2)
 
     @property
     def fiber_frame(self) -> ops.FiberFrame | None:
